@@ -13,13 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from stewart_drake.core.library import core
 from stewart_drake.dynamics.workspace import diagnose
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.live import contact as contacts
 from stewart_drake.live import session as sessions
 from stewart_drake.live.checks import DelayCheck
 from stewart_drake.live.contact import Contact, await_free, call, open_endpoint
-from stewart_drake.live.endpoint import ANSWERS, ANSWERS_AT_ONCE
 from stewart_drake.live.machine import Machine
 from stewart_drake.live.page import PageViewer
 from stewart_drake.live.protocol import (
@@ -51,7 +51,7 @@ SAMPLED = "sensor={kind: encoders, samples: 16, bits: 30}"
 
 def request_of(driver, sequence=1):
     """Return a request for a session, as somebody may record it."""
-    driver.session._sent = sequence - 1
+    driver.session._c.sent = sequence - 1
     return encode(ControllerMessage(driver.session.head(0), identity=driver.identity), KEY)
 
 
@@ -100,7 +100,8 @@ def test_answers_to_unknown_addresses_have_a_rate_and_are_no_longer_than_request
     for k in range(100):
         offers += ask(run, k * SECOND // 50, number=10)
         asked += 10
-    assert 2 * ANSWERS <= len(offers) <= 2 * ANSWERS + ANSWERS_AT_ONCE
+    most, at_once = core().lib.STEWART_ANSWERS, core().lib.STEWART_AT_ONCE
+    assert 2 * most <= len(offers) <= 2 * most + at_once
     assert run.ear.refused == {Refusal.RATE: asked - len(offers)}
     assert run.machine.session is None
     request = ControllerMessage(HEAD, identity=IDENTITY)

@@ -455,7 +455,7 @@ def attack(rng, run, attacker, recorded):
         mouth._socket.sendto(data, run.ear.address)
         return
     head = driver.session.head(time)
-    driver.session._sent -= 1
+    driver.session._c.sent -= 1
     head = replace(head, sequence=head.sequence + rng.randrange(3))
     rows = np.full((rng.randrange(1, 5), 6), rng.uniform(-9, 9))
     plan = ControllerMessage(head, sampled=time, playout=time, begin=driver.begin, torques=rows)

@@ -15,13 +15,14 @@ import numpy as np
 import pytest
 
 from stewart_drake.core import build
+from stewart_drake.core.library import core
 from stewart_drake.export.controller import TEMPLATES
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.live.endpoint import (
     SHORTEST_KEY,
     Endpoint,
+    Offers,
     Session,
-    Window,
     read_key,
 )
 from stewart_drake.live.protocol import (
@@ -32,6 +33,7 @@ from stewart_drake.live.protocol import (
     NEVER,
     SECOND,
     TAG,
+    VERSION,
     ControllerFlags,
     ControllerMessage,
     Head,
@@ -42,7 +44,17 @@ from stewart_drake.live.protocol import (
     decode,
     encode,
 )
-from stewart_drake.loop.peer import Fault, Identity, Part, Reason, identity_of
+from stewart_drake.loop.peer import (
+    DIGEST,
+    MOST_BITS,
+    MOST_SAMPLES,
+    NAME,
+    Fault,
+    Identity,
+    Part,
+    Reason,
+    identity_of,
+)
 from stewart_drake.scenario.loading import load_scenario
 from tests import exchange
 
@@ -190,6 +202,18 @@ def test_each_field_lies_where_the_tables_say():
     assert seen == 2 * 11 + 21 + 5
 
 
+def test_the_numbers_are_those_of_c():
+    lib = core().lib
+    for names in (MachineFlags, ControllerFlags):
+        assert all(one == getattr(lib, f"STEWART_{one.name}") for one in names)
+    assert [getattr(lib, f"STEWART_{one.name}") for one in Refusal] == [*range(1, 8)]
+    assert len(Fault) == lib.STEWART_FAULTS
+    most = lib.STEWART_ROWS, lib.STEWART_HISTORY, lib.STEWART_SAMPLES, lib.STEWART_BITS
+    assert most == (MOST_ROWS, MOST_HISTORY, MOST_SAMPLES, MOST_BITS)
+    assert (lib.STEWART_PROTOCOL, lib.STEWART_TAG, lib.STEWART_LONGEST) == (VERSION, TAG, LONGEST)
+    assert (lib.STEWART_DIGEST, lib.STEWART_NAME) == (DIGEST, NAME)
+
+
 def test_the_tag_is_the_first_half_of_an_hmac():
     data = encode(PLAN, KEY)
     assert data[-TAG:] == hmac.new(KEY, data[:-TAG], hashlib.sha256).digest()[:16]
@@ -317,11 +341,12 @@ def test_the_first_thing_that_is_wrong_is_the_cause():
 def test_a_window_takes_each_number_once():
     """Against a set of all that were seen, over numbers that overtake one another and repeat."""
     rng = random.Random(20261122)
-    window, seen, newest = Window(), set[int](), 0
+    here, seen, newest = ("127.0.0.1", 5), set[int](), 0
+    session = Session(9, here)
     causes = set()
     for _ in range(20_000):
         number = max(1, newest + rng.choice([-100, -64, -63, -5, -1, 0, 1, 1, 1, 2, 7, 63, 64, 90]))
-        found = window.take(number)
+        found = session.refusal(Head(9, 4, number, 0, 0, 0, 0), here, 0)
         if number <= newest - 64:
             expected = Refusal.LATE
         else:
@@ -330,7 +355,8 @@ def test_a_window_takes_each_number_once():
         causes.add(found)
         seen.add(number)
         newest = max(newest, number)
-        assert [n for n in range(newest, newest - 64, -1) if window.seen >> (newest - n) & 1] == [
+        bits = session.window.seen
+        assert [n for n in range(newest, newest - 64, -1) if bits >> (newest - n) & 1] == [
             n for n in range(newest, newest - 64, -1) if n in seen and n > 0
         ]
     assert causes == {None, Refusal.LATE, Refusal.REPLAYED}
@@ -351,6 +377,15 @@ def test_a_session_is_of_two_numbers_and_an_address():
     head = session.head(1500)
     assert (head.sequence, head.acknowledged, head.echo, head.held) == (1, 1, 100, 500)
     assert session.head(1600).sequence == 2
+
+
+def test_a_nonce_is_of_session_address_secret_and_the_sessions_so_far():
+    offers, address = Offers(bytes(range(32))), ("127.0.0.1", 50000)
+    first = offers.nonce(7, address)
+    others = offers.nonce(8, address), offers.nonce(7, ("127.0.0.2", 50000))
+    others = *others, offers.nonce(7, ("127.0.0.1", 50001)), Offers().nonce(7, address)
+    offers.taken()
+    assert len({0, first, *others, offers.nonce(7, address)}) == 7
 
 
 # ---------------------------------------------------------------- sockets
@@ -407,7 +442,8 @@ def codec(tmp_path_factory):
     if compiler is None:
         pytest.skip("there is no C compiler")
     made = tmp_path_factory.mktemp("codec") / "protocol_test"
-    sources = [str(TEMPLATES / name) for name in ("protocol.c", "protocol_test.c")]
+    sources = [str(build.FOLDER / "protocol.c"), str(TEMPLATES / "protocol_test.c")]
+    sources += [f"-I{build.FOLDER}"]
     flags = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-g"]
     flags += ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
     subprocess.run([*compiler, *flags, *sources, "-lm", "-o", str(made)], check=True)

@@ -93,7 +93,7 @@ static int leave(dop853 *s, const stewart_run *r, double from, double to)
     dop853_at(s, to, x);
     s->time = to;
     stewart_copy(X, x, s->x);
-    return STEWART_LEFT;
+    return STEWART_OUTSIDE;
 }
 
 /* Advance to `end`, up to which the command is constant, and record the states at the run's times. */

@@ -15,7 +15,7 @@
 /* Hash of the source that this library was compiled from. */
 const char *stewart_source(void);
 
-enum { STEWART_INSIDE, STEWART_LEFT, STEWART_TOO_SHORT_STEPS, STEWART_CONTROLLER_FAILED };
+enum { STEWART_INSIDE, STEWART_OUTSIDE, STEWART_TOO_SHORT_STEPS, STEWART_CONTROLLER_FAILED };
 
 /* A run. `time` and `state` are those of its start, then of its end. */
 typedef struct {

@@ -60,8 +60,10 @@ LINK: Final = ("link.h", "link.c")
 MOTION: Final = ("motion.h", "motion.c")
 """Additional sources of core/ for the scenario's motion."""
 MOTION_TEMPLATES: Final = ("stewart_motion.c", "stewart_motion.h")
+PROTOCOL: Final = ("protocol.h", "protocol.c")
+"""Additional sources of core/ for datagrams."""
 OVER_UDP: Final = (
-    *("protocol.c", "protocol.h", "protocol_test.c", "udp.c", "udp.h"),
+    *("protocol_test.c", "udp.c", "udp.h"),
     *("stewart_example.c", "stewart_example.h", "stewart_udp.c"),
 )
 """Templates of the controller over UDP, see `_no_udp_reason`."""
@@ -149,6 +151,7 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
     over_udp, has_motion = not no_udp_reason, not no_udp_reason or recorded.moves
     sources = _sources(compiled, tuner)
     copied = *sources, *(() if no_machine_reason else LINK), *(MOTION if has_motion else ())
+    copied = *copied, *(PROTOCOL if over_udp else ())
     omitted = {
         *(() if over_udp else OVER_UDP),
         *(MACHINE if no_machine_reason else ()),

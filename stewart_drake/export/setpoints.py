@@ -168,28 +168,15 @@ def make_setpoints(
     start: Sequence[float] | Array | None = None,
     soft_end: bool = False,
 ) -> Setpoints:
-    """Return the setpoints of a scenario's motion.
+    """Return the setpoints of a scenario's motion, see `functions.setpoints`.
 
     Setpoint k is held for a period h = 1 / rate from t_k = k h on. With the motion taken in the
-    middle of that, it is (setpoint) of `law.servos`: the crank angle, plus torque and velocity gain
-    over the stiffness. What was learned (`controller.learned`) is added. The torque is that of the
-    exact inverse dynamics, with the scenario's `actuator` and `plant`; values of a
-    `controller.calibration` replace those of the plant.
+    middle of that, it is (setpoint) of `law.servos`. What was learned (`controller.learned`) is
+    added. Values of a `controller.calibration` replace those of the plant.
 
-    A motion that does not begin at rest where the plate is, starts softly. From the pose x_0, which
-    is `start`, or for `start: rest` that of the scenario, to the reference r the motion is
-
-        x(t) = x_0 + g(t / T) (r(t) - x_0),   g(s) = 10 s^3 - 15 s^4 + 6 s^5 up to s = 1, then 1.
-
-    T is 1 s, or 2, 4, .. s if the limits need it. What was learned is blended in alike. A soft end
-    is the same, backwards in time from rest at the reference's pose at the end.
-
-    Args:
-        scenario: whose motors are position servos.
-        rate: of the setpoints, Hz.
-        plain: whether to send the crank angles alone.
-        start: (6,) pose at which the plate rests at t = 0, rad and m.
-        soft_end: whether the motion ends at rest.
+    A motion that does not begin at rest where the plate is, starts softly (theory.md, section 40),
+    in 1 s, or 2, 4, .. s if the limits need it. What was learned is blended in alike. A soft end is
+    the same, backwards in time from rest at the reference's pose at the end.
 
     Raises:
         ConfigError: bad input, or a motion beyond reach, or beyond the range, speed or torque of a

@@ -4,33 +4,12 @@ A servo at each crank a has the torque clip(k (u(t - d) - a)) - D a' - F tanh(a'
 stiffness k, damping D (with its velocity gain), friction F with the speed s, armature I, and the
 sum d of all delays. The ball joints have the friction f and the damping c.
 
-Regression. Along the measured motion, smoothed by a filter that smooths u alike,
+`regression` gives the start of a fit by output error, the least squares of r = a(theta) - measured.
+A second fit minimises the innovations (`innovations.py`) of a model in which the friction of slow
+cranks is an unknown torque. The intervals join a jackknife over B blocks of the log, with H = J'J
+and g_b = J_b' e_b, and the inverse of H:
 
-    u(t - d) - a = (tau + D a' + F tanh(a' / s) + I a'' + f b_f + c b_c) / k
-
-is linear but in d, which is scanned: tau is the torque of the bodies, b_f and b_c those of unit
-friction of the ball joints.
-
-Output error. The exact plant under the setpoints of the log has crank angles a(t; theta); the least
-squares of their deviations r = a(theta) - measured begin at the regression.
-
-Second fit. About a reversal, the friction of a real or simulated motor is not F tanh(a' / s), and
-delay and damping would make up for it. So near the first fit, a slow crank gets an unknown torque
-with a standard deviation of F in each period, and the second fit minimises the innovations of
-that model (`innovations.py`): the friction of faster cranks is F under any law. If the rms of its
-innovations exceeds 1, something else is wrong, such as the friction of ball joints. Then the change
-from the first fit to the second is added to the intervals in quadrature, and above 1.5 the first
-fit counts.
-
-Intervals. With J = de/dtheta of the innovations e and H = J'J, H^-1 is their covariance if rounding
-and unknown friction are all that there is. Other errors differ from one kind of motion to another.
-The log is cut into B blocks, about as long as a kind of motion. With g_b = J_b' e_b, whose sum is 0
-at the fit, the fit without block b differs by
-
-    delta_b = (H - H_b)^-1 g_b,   P = (B - 1) / B sum_b delta_b delta_b'       (jackknife)
-
-Blocks may have any correlation inside. The interval is t(B - 1) sqrt(P), with Student's t, plus
-1.96 sqrt(H^-1) in quadrature: P of few blocks may be small by chance.
+    delta_b = (H - H_b)^-1 g_b,   P = (B - 1) / B sum_b delta_b delta_b'
 """
 
 import math

@@ -31,6 +31,7 @@ _FEWEST: Final = 8  # least number of poses that give rates
 _WINDOW: Final = 0.3  # least length of the polynomial that gives an acceleration, s
 _DEGREE: Final = 4  # of that polynomial
 _GRID: Final = 0.01  # step of the delays, s
+_APART: Final = 0.1  # time between the middles of two such polynomials, s
 _LEAST_WINDOWS: Final = 8
 
 
@@ -73,8 +74,8 @@ def coarse_delay(
     dynamics = StewartDynamics(mechanism, log.gravity)
     known = np.flatnonzero(np.isfinite(poses).all(axis=1))
     times = log.times[known]
-    half = max(_WINDOW, 4.5 * float(np.median(np.diff(times)))) / 2
-    middles = np.arange(times[0] + half, times[-1] - half, _GRID * 10)
+    half = max(_WINDOW, (_DEGREE + 0.5) * float(np.median(np.diff(times)))) / 2
+    middles = np.arange(times[0] + half, times[-1] - half, _APART)
     needed = np.full((len(middles), NUM_TORQUES), np.nan)
     for i, middle in enumerate(middles):
         near = known[np.abs(times - middle) <= half + 1e-9]

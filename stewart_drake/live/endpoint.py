@@ -4,22 +4,20 @@ Without a key only the loopback interface is used. Refused datagrams are counted
 """
 
 import contextlib
-import hashlib
-import hmac
 import ipaddress
 import secrets
 import socket
-import struct
 import time
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final, Generic, NamedTuple, TypeVar
+from typing import Any, Final, Generic, NamedTuple, TypeVar
 
+from stewart_drake.core.library import core
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.live.protocol import (
     LONGEST,
+    REFUSALS,
     SECOND,
     ControllerMessage,
     Head,
@@ -29,24 +27,20 @@ from stewart_drake.live.protocol import (
     RefusedError,
     decode,
     encode,
+    head_of,
+    in_c,
     version_refusal,
 )
 
 Address = tuple[str, int]
 Taken = TypeVar("Taken", MachineMessage, ControllerMessage)
 
-WINDOW: Final = 64
-"""Number of datagrams by which one may be overtaken without counting as late."""
 AT_ONCE: Final = 256
 """Largest number of datagrams that are read at once."""
 SHORTEST_KEY: Final = 16
 """Shortest key, bytes."""
 LONGEST_KEY: Final = 4096
 """Longest key, bytes."""
-ANSWERS: Final = 50
-"""Number of requests of unknown addresses that are answered in a second."""
-ANSWERS_AT_ONCE: Final = 10
-"""Number of them without a pause."""
 STALL: Final = SECOND // 5
 """Delay of a process from which on it is reported as a stall, ns."""
 
@@ -57,12 +51,16 @@ def now() -> int:
 
 
 class OtherVersion(NamedTuple):
-    """A datagram of another version of the protocol, and its sender."""
+    data: bytes
+    address: Address  # of its sender
 
-    version: int
-    session: int
-    sequence: int
-    address: Address
+    @property
+    def version(self) -> int:
+        return self.data[4]
+
+    @property
+    def session(self) -> int:
+        return int.from_bytes(self.data[8:16], "little")
 
 
 class Endpoint(Generic[Taken]):
@@ -136,7 +134,7 @@ class Endpoint(Generic[Taken]):
     def refuse_version(self, other: "OtherVersion") -> None:
         """Send this side's version to a peer of another one, in a head alone."""
         with contextlib.suppress(OSError):
-            self._socket.sendto(version_refusal(other.session, other.sequence), other.address)
+            self._socket.sendto(version_refusal(other.data), other.address)
 
     def receive(self) -> Iterator[tuple[Taken, Address]]:
         """Yield what has come, at most AT_ONCE datagrams."""
@@ -152,8 +150,7 @@ class Endpoint(Generic[Taken]):
             except RefusedError as refused:
                 self.refuse(refused.cause, refused.detail)
                 if refused.cause == Refusal.VERSION:
-                    session, sequence = struct.unpack_from("<Q8xI", data, 8)
-                    self.versions = [OtherVersion(data[4], session, sequence, address)]
+                    self.versions = [OtherVersion(data, address)]
                 continue
             if isinstance(message, self._takes):
                 yield message, address
@@ -186,40 +183,32 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-@dataclass
-class Window:
-    """Sequence numbers that have come, of the last WINDOW."""
-
-    newest: int = 0  # the newest, 0 for none
-    seen: int = 0  # bit i is set if `newest` - i has come
-
-    def take(self, sequence: int) -> Refusal | None:
-        """Note a number; return why it is refused, or None."""
-        behind = self.newest - sequence
-        if behind < 0:
-            self.seen = (self.seen << -behind if -behind < WINDOW else 0) & (2**WINDOW - 1) | 1
-            self.newest = sequence
-            return None
-        if behind >= WINDOW:
-            return Refusal.LATE
-        if self.seen >> behind & 1:
-            return Refusal.REPLAYED
-        self.seen |= 1 << behind
-        return None
-
-
-@dataclass
 class Session:
-    """One side's view of a session."""
+    """One side's view of a session, by `stewart_session` of core/protocol.h.
 
-    number: int  # random number of the controller
-    address: Address  # address of the other side
-    nonce: int = 0  # random number of the machine; 0 before its offer
-    window: Window = field(default_factory=Window)  # sequence numbers that have come
-    heard: int = 0  # own clock when the last datagram was accepted, ns; 0 for none
-    _sent: int = 0
-    _echo: int = 0
-    _got: int = 0
+    Attributes:
+        address: of the other side.
+        nonce: random number of the machine; 0 before its offer.
+        window: sequence numbers that have come: the `newest`, 0 for none, and in bit i of `seen`
+            whether `newest` - i has come.
+        heard: own clock when the last datagram was accepted, ns; 0 for none.
+    """
+
+    def __init__(self, number: int, address: Address, nonce: int = 0) -> None:
+        self.address = address
+        self._c: Any = core().ffi.new("stewart_session *", {"number": number, "nonce": nonce})
+
+    number = property(lambda self: self._c.number)  # random number of the controller
+    window = property(lambda self: self._c.window)
+    heard = property(lambda self: self._c.heard)
+
+    @property
+    def nonce(self) -> int:
+        return int(self._c.nonce)
+
+    @nonce.setter
+    def nonce(self, nonce: int) -> None:
+        self._c.nonce = nonce
 
     @classmethod
     def drawn(cls, address: Address) -> "Session":
@@ -232,35 +221,23 @@ class Session:
 
         Its sequences continue those of the offers, which repeat the requests'.
         """
-        session = cls(head.session, address, head.nonce, _sent=head.sequence - 1)
-        session.refusal(head, address, time)
+        session = cls(head.session, address, head.nonce)
+        session._c[0] = core().lib.stewart_confirmed(in_c(head), time)
         return session
 
     def head(self, time: int) -> Head:
         """Return the head of the next datagram, sent at `time`, ns of the own clock."""
-        self._sent += 1
-        held = time - self._got if self.window.newest else 0
-        return Head(
-            *(self.number, self.nonce, self._sent, self.window.newest, time, self._echo, held)
-        )
+        return head_of(core().lib.stewart_next(self._c, time, 0))
 
     def refusal(self, head: Head, address: Address, time: int) -> Refusal | None:
         """Accept a datagram that came at `time`, ns of the own clock; return why not, or None."""
-        if head.session != self.number or address != self.address:
+        if address != self.address:
             return Refusal.FOREIGN
-        if self.nonce not in (0, head.nonce):
-            return Refusal.FOREIGN
-        before = self.window.newest
-        refused = self.window.take(head.sequence)
-        if refused is None:
-            self.heard = time
-            if head.sequence > before:
-                self._echo, self._got = head.time, time
-        return refused
+        return REFUSALS[core().lib.stewart_note(self._c, in_c(head), time)]
 
 
 class Offers:
-    """Offers of sessions, without state per request.
+    """Offers of sessions, without state per request, by `stewart_offers` of core/protocol.h.
 
     A nonce is an HMAC of the session, its address and the number of sessions so far, under a secret
     of this process. Only the receiver of an offer knows it, and recorded sessions cannot be
@@ -268,24 +245,19 @@ class Offers:
     """
 
     def __init__(self, secret: bytes | None = None) -> None:
-        self._secret = secrets.token_bytes(32) if secret is None else secret
-        self._sessions, self._tokens, self._counted = 0, float(ANSWERS_AT_ONCE), 0
+        drawn = list(secret or secrets.token_bytes(32))
+        start = {"secret": drawn, "tokens": core().lib.STEWART_AT_ONCE}
+        self._c: Any = core().ffi.new("stewart_offers *", start)
 
     def nonce(self, session: int, address: Address) -> int:
         """Return the nonce for a session and an address, not 0."""
-        text = f"{session} {address[0]} {address[1]} {self._sessions}"
-        digest = hmac.new(self._secret, text.encode(), hashlib.sha256).digest()
-        return int.from_bytes(digest[:8], "little") or 1
+        host = int(ipaddress.IPv4Address(address[0]))
+        return int(core().lib.stewart_nonce(self._c, session, host, address[1]))
 
     def taken(self) -> None:
         """Withdraw all offers, because a session has begun."""
-        self._sessions += 1
+        self._c.sessions += 1
 
     def may_answer(self, time: int) -> bool:
         """Take an answer to an unknown address from the allowance; return whether there is one."""
-        grown = self._tokens + (time - self._counted) * ANSWERS / SECOND
-        self._tokens, self._counted = min(float(ANSWERS_AT_ONCE), grown), time
-        if self._tokens < 1:
-            return False
-        self._tokens -= 1
-        return True
+        return bool(core().lib.stewart_may_answer(self._c, time))

@@ -1,31 +1,20 @@
 """The reference of a live run: the scenario's motion, or a target set by hand through a governor.
 
-The governor approaches a target smoothly and within the machine's limits. Each coordinate follows
-an applied target g through three equal poles,
+The governor (theory.md, section 36) approaches a target smoothly and within the machine's limits.
+Each coordinate follows an applied target g through three equal poles; with e = q - g at the start,
 
     q''' = w^3 (g - q) - 3 w^2 q' - 3 w q'',
-
-so that pose, rates and accelerations are continuous. With e = q - g at the start, and g constant,
-
     e(t) = (c0 + c1 t + c2 t^2) exp(-w t),
     c0 = e,   c1 = q' + w e,   c2 = (q'' + 2 w q' + w^2 e) / 2.
 
-The impulse response of three equal poles is positive. A target that moves one way therefore moves
-the coordinate that way without overshoot, and a pose at rest never turns back.
-
-The governor moves g towards the target by the largest share k in [0, 1] for which the whole future
-under g + k (target - g) keeps to the limits (scalar reference governor; Garone, Di Cairano,
-Kolmanovsky, "Reference and command governors for systems with constraints", Automatica 75, 2017).
-k = 0 is the future that was checked before, so that a solution always exists: the plate stays
-within the limits and can stop at g at any time.
-
-A step takes torque in proportion to w^2. At each period w is therefore the fastest pace whose whole
-future keeps to the torque limit. A slower w than before makes a moving plate stop later, possibly
-beyond g, so that it is taken only if it makes no rate change its sign.
+g moves towards the target by the largest share for which the whole future with constant g keeps to
+the limits. The share 0 is the future that was checked before, so that a solution always exists. A
+step takes torque in proportion to w^2: w is the fastest pace whose future keeps to the torque
+limit. A slower w than before makes a moving plate stop later, so that it is taken only if it makes
+no rate change its sign.
 
 A torque computed at t acts at t + eta and is computed from the reference up to t + h, h >= eta. A
-request at t therefore changes the reference from t + h on, and nothing before: torques in flight
-stay right, and a moving target causes no tracking error. A hand waits for h.
+request at t therefore changes the reference from t + h on, and nothing before.
 """
 
 from collections.abc import Callable, Iterator, Sequence

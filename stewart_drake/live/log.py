@@ -39,6 +39,8 @@ _LATEST: Final = 0.5
 """The same, s."""
 _KEPT: Final = 96
 """Number of periods whose applied torques are kept."""
+_HELD: Final = tuple(ports_of("controller").values())
+"""Signals that are in the memory of the law."""
 
 
 class RowFile:
@@ -202,6 +204,3 @@ class LiveRecord(Record):
         parts = [row[signal.exported][signal.part] for signal in self._recorded]
         self._file.append(np.concatenate([[number * self._period], *parts, row["step"]]))
         self.mirror(number * self._period, row)
-
-
-_HELD: Final = tuple(ports_of("controller").values())

@@ -55,6 +55,9 @@ LAST_DATAGRAMS: Final = 3
 """Number of datagrams that announce the end."""
 FURTHEST: Final = 3600 * SECOND
 """Longest time ahead for a begin or a plan, ns."""
+ARRIVES, MEASURES, CHANGES, SENDS, DRIVES = range(5)
+"""Order of events at equal instants: datagrams, measurements, torques, what is sent or written, and
+a robot's setpoints."""
 
 
 def check_scenario(scenario: Scenario) -> None:
@@ -121,7 +124,7 @@ class Machine:
         self.longest_lag, self._stalled_until = 0, -1
         self._safe = self._stopped = False
         self._at_rest()
-        self._at(0, 1, self._take_sample)
+        self._at(0, MEASURES, self._take_sample)
 
     def _at_rest(self) -> None:
         """Reset the plate to the scenario's start, with brakes on."""
@@ -185,7 +188,7 @@ class Machine:
             if under_way is None:
                 self.counts["lost"] += 1
                 continue
-            self._at(time + under_way, 0, partial(self._arrive, message, address))
+            self._at(time + under_way, ARRIVES, partial(self._arrive, message, address))
         if self._endpoint.refused[Refusal.KEY] and not self._key_said:
             self._key_said = True
             self._say(
@@ -224,7 +227,7 @@ class Machine:
     def _next(self) -> tuple[int, Callable[[int], None]]:
         when, order, _, do = self._due[0]
         change, silent = self._motors.next_change, self._deadline()
-        if self.failure is None and (change, 2) < (when, order):
+        if self.failure is None and (change, CHANGES) < (when, order):
             when, do = change, self._change
         else:
             do = self._pop
@@ -307,13 +310,13 @@ class Machine:
         if self._running and self._log is not None:
             state = np.array(self._body.state)
             row = {"pose": state[POSE], "rates": state[RATES], "measurement": np.array(values)}
-            self._at(time, 3, lambda _: self._write_row(time, row))  # after the torque's change
+            self._at(time, SENDS, lambda _: self._write_row(time, row))
         if self._running:
             number = max(0, round((time - self._origin) / self.period))
         waits = self._times.of("sensor", number)
         fields = {} if waits is None else self._fields.of(values)
-        self._at(time + (waits or 0), 1, lambda _: self._answer(time, fields, number))
-        self._at(time + self.period, 1, self._take_sample)
+        self._at(time + (waits or 0), MEASURES, lambda _: self._answer(time, fields, number))
+        self._at(time + self.period, MEASURES, self._take_sample)
 
     def _write_row(self, time: int, row: dict[str, Array]) -> None:
         assert self._log is not None
@@ -436,7 +439,7 @@ class Machine:
             asked = max(message.begin, time + 1)
             self.begin = -(-asked // self.period) * self.period
             if not self._running:
-                self._at(self.begin, 0, self._begin)
+                self._at(self.begin, ARRIVES, self._begin)
         if len(message.torques) and message.cranks != self._motors.cranks:
             self._endpoint.refuse(
                 Refusal.MALFORMED, "torques for servos, or crank angles for motors"
@@ -475,7 +478,7 @@ class Machine:
         else:
             self.counts["sent"] += 1
             due = message.head.time + under_way
-            self._at(due, 3, lambda _: self._endpoint.send(message, to))
+            self._at(due, SENDS, lambda _: self._endpoint.send(message, to))
 
     def _flags(self) -> MachineFlags:
         states = {

@@ -1,14 +1,10 @@
-"""The datagrams between a machine and its controller: contents and encoding.
+"""The datagrams between a machine and its controller: contents, and their bytes by core/protocol.h.
 
-docs/protocol.md defines every byte; `export-c` writes the same protocol in C. Numbers are
-little-endian. Times are whole nanoseconds of the *machine's* clock, which starts with the machine.
-Exceptions are `time`, of the sender's clock, and `echo`, of the receiver's.
+docs/protocol.md defines every byte; an export has the same C. Times are whole nanoseconds of the
+*machine's* clock, which starts with the machine. Exceptions are `time`, of the sender's clock, and
+`echo`, of the receiver's.
 """
 
-import hashlib
-import hmac
-import math
-import struct
 from dataclasses import dataclass, field
 from enum import Enum, IntFlag
 from typing import Any, Final
@@ -16,12 +12,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from stewart_drake.core.library import core
 from stewart_drake.loop.peer import (
-    DIGEST,
-    MOST_BITS,
     MOST_ROWS,
     MOST_SAMPLES,
-    NAME,
     NO_FAULT,
     Fault,
     Identity,
@@ -29,12 +23,10 @@ from stewart_drake.loop.peer import (
     Reason,
     in_words,
 )
-from stewart_drake.scenario.signals import NUM_LEGS, NUM_STATE, NUM_TORQUES
+from stewart_drake.scenario.signals import NUM_TORQUES
 from stewart_drake.types import Array
 
 VERSION: Final = 3
-MAGIC_MACHINE: Final = b"STWM"
-MAGIC_CONTROLLER: Final = b"STWC"
 TAG: Final = 16
 """Bytes of HMAC-SHA256 at the end of a datagram with a key."""
 NEVER: Final = 2**64 - 1
@@ -47,27 +39,12 @@ MISSING: Final = -(2**31)
 """Code of a missing sample."""
 SECOND: Final = 10**9
 
-# magic, version, bytes of the tag, bytes in all, session, nonce, sequence, acknowledged, time,
-# echo, held, flags
-_HEAD: Final = struct.Struct("<4sBBHQQIIQQQI")
-_MACHINE: Final = struct.Struct("<BBBBQQQQddQQIIIBBBBQQ")
-_MACHINE_NUMBERS: Final = (
-    *("kind", "samples", "bits", "history", "sampled", "begin", "period", "watchdog", "rate"),
-    *("torque_limit", "arrived", "acted_from", "played", "dry", "refused"),
-    *("fault", "leg", "before", "content", "lasted", "before_lasted"),
+_HEAD: Final = ("session", "nonce", "sequence", "acknowledged", "time", "echo", "held")
+_MACHINE: Final = (
+    *("bits", "sampled", "begin", "period", "watchdog", "rate", "torque_limit", "arrived"),
+    *("acted_from", "played", "dry", "refused"),
 )
-# rows, content, reserved (2); sampled, playout, begin
-_CONTROLLER: Final = struct.Struct("<BB2xQQQ")
-_PART: Final = struct.Struct(f"<{DIGEST}s{NAME}s")
-_IDENTITY: Final = _PART.size * len(Identity._fields)
-_PADDING: Final = bytes(_MACHINE.size - _CONTROLLER.size)
-"""Padding that makes a request as long as its answer."""
-_REQUEST: Final = 1
-"""Content of a controller's datagram with an identity."""
-_CRANKS: Final = 2
-"""Content of a datagram whose rows are crank angles."""
-_OFFERS: Final = 3
-"""Kind of a machine's datagram with its identity instead of a measurement."""
+"""Numbers that have the same name in a message and in core/protocol.h."""
 
 
 class Refusal(Enum):
@@ -84,6 +61,10 @@ class Refusal(Enum):
     """Too old to be used, or to be distinguished from a replay."""
     RATE = "rate"
     """A request of an unknown address, above the rate at which these are answered."""
+
+
+REFUSALS: Final = (None, *Refusal)
+"""By the number in C."""
 
 
 class RefusedError(Exception):
@@ -199,77 +180,71 @@ class ControllerMessage:
 Message = MachineMessage | ControllerMessage
 
 
-# ---------------------------------------------------------------- writing
+# ---------------------------------------------------------------- bytes
 
 
 def encode(message: Message, key: bytes | None = None) -> bytes:
     """Return the datagram of a message, with a tag if there is a key.
 
     Raises:
-        ValueError: a count outside its range, or more than LONGEST bytes.
-        struct.error: a number that does not fit its field.
+        ValueError: a count outside its range.
+        OverflowError: a number that does not fit its field.
     """
+    c = core()
     if isinstance(message, MachineMessage):
-        magic, body = MAGIC_MACHINE, _machine_body(message)
+        kind, fields = "measured", _of_machine(message)
     else:
-        magic, body = MAGIC_CONTROLLER, _controller_body(message)
-    tag = 0 if key is None else TAG
-    length = _HEAD.size + len(body) + tag
-    if length > LONGEST:
-        raise ValueError(f"datagram: got {length} bytes; expected at most {LONGEST}")
-    h = message.head
-    numbers = (h.session, h.nonce, h.sequence, h.acknowledged, h.time, h.echo, h.held)
-    data = _HEAD.pack(magic, VERSION, tag, length, *numbers, int(message.flags)) + body
-    return data if key is None else data + _tag(data, key)
+        kind, fields = "plan", _of_controller(message)
+    fields["head"] = vars(message.head) | {"flags": int(message.flags)}
+    if message.identity is not None:
+        parts = [(list(one.digest), one.name.encode("ascii")) for one in message.identity]
+        fields["identity"] = {"parts": parts}
+    data, given = c.ffi.new("uint8_t[]", LONGEST), c.ffi.new(f"stewart_{kind} *", fields)
+    secret, _kept = _key(key)
+    size = getattr(c.lib, f"stewart_write_{kind}")(given, secret, data)
+    return bytes(c.ffi.buffer(data, size))
 
 
-def _tag(data: bytes, key: bytes) -> bytes:
-    return hmac.new(key, data, hashlib.sha256).digest()[:TAG]
+def _key(key: bytes | None) -> tuple[Any, object]:
+    """Return a `stewart_key`, and the memory that it uses."""
+    c = core()
+    kept = c.ffi.from_buffer(key or b"")
+    return c.ffi.new("stewart_key *", (kept, len(kept)))[0], kept
 
 
-def _machine_body(m: MachineMessage) -> bytes:
-    _check(m.acted, "acted", MOST_HISTORY)
-    kind, samples, measured = 0, 0, b""
+def _of_machine(m: MachineMessage) -> dict[str, Any]:
+    lib, fields = core().lib, {name: getattr(m, name) for name in _MACHINE}
+    content = lib.STEWART_CRANKS if m.cranks else lib.STEWART_TORQUES
+    acted = _rows(m.acted, "acted", MOST_HISTORY)
+    fields |= {"acted": acted, "history": len(acted), "content": content}
+    fields |= {"reason": m.reason, "before": m.before}
     if m.state is not None:
-        kind, samples, measured = 1, 1, np.asarray(m.state, "<f8").tobytes()
+        fields |= {"kind": lib.STEWART_STATE, "samples": 1, "state": m.state.tolist()}
     elif m.codes is not None and m.zeros is not None:
-        kind, samples = 2, len(m.codes)
-        _check(m.codes, "codes", MOST_SAMPLES)
-        zeros, codes = np.asarray(m.zeros, "<f8"), np.asarray(m.codes, "<i4")
-        measured = zeros.tobytes() + codes.tobytes()
+        codes = _rows(m.codes, "codes", MOST_SAMPLES)
+        fields |= {"kind": lib.STEWART_ENCODERS, "samples": len(codes), "codes": codes}
+        fields["zeros"] = m.zeros.tolist()
     elif m.identity is not None:
-        kind, measured = _OFFERS, m.identity.packed
-    numbers = vars(m) | {"kind": kind, "samples": samples, "history": len(m.acted)}
-    numbers |= {"fault": m.reason.fault, "leg": m.reason.leg, "lasted": m.reason.lasted}
-    numbers |= {"before": m.before.fault, "before_lasted": m.before.lasted}
-    numbers |= {"content": _CRANKS * m.cranks}
-    packed = _MACHINE.pack(*(numbers[name] for name in _MACHINE_NUMBERS))
-    return packed + measured + np.asarray(m.acted, "<f8").tobytes()
+        fields["kind"] = lib.STEWART_OFFER
+    return fields
 
 
-def _controller_body(m: ControllerMessage) -> bytes:
-    _check(m.torques, "torques", MOST_ROWS)
-    content = _CRANKS * m.cranks if m.identity is None else _REQUEST
-    packed = _CONTROLLER.pack(len(m.torques), content, m.sampled, m.playout, m.begin)
+def _of_controller(m: ControllerMessage) -> dict[str, Any]:
+    lib, rows = core().lib, _rows(m.torques, "torques", MOST_ROWS)
+    content = lib.STEWART_CRANKS if m.cranks else lib.STEWART_TORQUES
     if m.identity is not None:
-        if len(m.torques):
+        content = lib.STEWART_REQUEST
+        if rows:
             raise ValueError("torques: got some in a request; expected none")
-        return packed + m.identity.packed + _PADDING
-    return packed + np.asarray(m.torques, "<f8").tobytes()
+    times = {name: getattr(m, name) for name in ("sampled", "playout", "begin")}
+    return times | {"rows": len(rows), "content": content, "torques": rows}
 
 
-def version_refusal(session: int, acknowledged: int) -> bytes:
-    """Return a head alone, which states this version to a controller of another one."""
-    numbers = (session, 0, 1, acknowledged, 0, 0, 0, 0)
-    return _HEAD.pack(MAGIC_MACHINE, VERSION, 0, _HEAD.size, *numbers)
-
-
-def _check(rows: NDArray[Any], name: str, most: int) -> None:
+def _rows(rows: NDArray[Any], name: str, most: int) -> list[Any]:
     if rows.ndim != 2 or rows.shape[1] != NUM_TORQUES or len(rows) > most:
         raise ValueError(f"{name}: got shape {rows.shape}; expected up to {most} rows of six")
-
-
-# ---------------------------------------------------------------- reading
+    found: list[Any] = rows.tolist()
+    return found
 
 
 def decode(data: bytes, key: bytes | None = None) -> Message:
@@ -280,98 +255,71 @@ def decode(data: bytes, key: bytes | None = None) -> Message:
     Raises:
         RefusedError: malformed, version or key.
     """
-    _demand(_HEAD.size <= len(data) <= LONGEST, f"{len(data)} bytes")
-    magic, version, tag, length, *numbers, flags = _HEAD.unpack_from(data)
-    _demand(magic in (MAGIC_MACHINE, MAGIC_CONTROLLER), f"magic {magic!r}")
-    if version != VERSION:
-        raise RefusedError(Refusal.VERSION, str(version))
-    fits = length == len(data) and tag in (0, TAG) and length >= _HEAD.size + tag
-    _demand(fits, f"{len(data)} bytes that say {length}, tag {tag}")
-    _authenticate(data, tag, key)
-    head, body = Head(*numbers), data[_HEAD.size : length - tag]
-    _demand(head.session > 0 and head.sequence > 0, "a session or a sequence of 0")
-    if magic == MAGIC_MACHINE:
-        return _machine(head, flags, body)
-    return _controller(head, flags, body)
+    c = core()
+    is_machine, (secret, _kept) = data[:4] == b"STWM", _key(key)
+    kind = "measured" if is_machine else "plan"
+    read = c.ffi.new(f"stewart_{kind} *")
+    given = c.ffi.from_buffer("uint8_t[]", data)
+    if cause := getattr(c.lib, f"stewart_read_{kind}")(given, len(data), secret, read):
+        refusal = REFUSALS[cause]
+        version = refusal == Refusal.VERSION
+        raise RefusedError(refusal, str(data[4]) if version else f"{len(data)} bytes")
+    head = head_of(read.head)
+    return _machine(head, read) if is_machine else _controller(head, read)
 
 
-def _demand(holds: bool | None, problem: str) -> None:
-    if not holds:
-        raise RefusedError(Refusal.MALFORMED, problem)
+def version_refusal(data: bytes) -> bytes:
+    """Return a head alone, which states this version to a controller of another one."""
+    c, answer = core(), core().ffi.new("uint8_t[]", LONGEST)
+    size = c.lib.stewart_write_version(c.ffi.from_buffer("uint8_t[]", data), answer)
+    return bytes(c.ffi.buffer(answer, size))
 
 
-def _authenticate(data: bytes, tag: int, key: bytes | None) -> None:
-    if (tag != 0) != (key is not None):
-        raise RefusedError(Refusal.KEY, "a tag" if tag else "no tag")
-    if key is not None and not hmac.compare_digest(_tag(data[:-TAG], key), data[-TAG:]):
-        raise RefusedError(Refusal.KEY, "a wrong tag")
+def head_of(read: Any) -> Head:
+    """Return a head from that in C."""
+    return Head(*(getattr(read, name) for name in _HEAD))
 
 
-def _machine(head: Head, flags: int, body: bytes) -> MachineMessage:
-    _demand(len(body) >= _MACHINE.size, "a short body")
-    n = dict(zip(_MACHINE_NUMBERS, _MACHINE.unpack_from(body), strict=True))
-    kind, samples, bits, history = (n[name] for name in _MACHINE_NUMBERS[:4])
-    fits = {
-        0: samples == 0 and bits == 0,
-        1: samples == 1 and bits == 0,
-        2: 1 <= samples <= MOST_SAMPLES and 1 <= bits <= MOST_BITS,
-        _OFFERS: samples == 0 and bits == 0 and history == 0,
-    }
-    encoders = 8 * NUM_LEGS + 4 * NUM_LEGS * samples
-    sizes = {0: 0, 1: 8 * NUM_STATE, 2: encoders, _OFFERS: _IDENTITY}
-    plausible = 0 < n["rate"] < math.inf and n["torque_limit"] > 0 and n["period"] > 0
-    plausible = plausible and n["content"] in (0, _CRANKS) and n["leg"] <= NUM_LEGS
-    plausible = plausible and max(n["fault"], n["before"]) < len(Fault) and flags < 1024
-    plausible = plausible and history <= MOST_HISTORY
-    _demand(fits.get(kind) and plausible, "a number outside its range")
-    length = _MACHINE.size + sizes[kind] + 8 * NUM_TORQUES * history
-    _demand(len(body) == length, "a body of another length")
-    measured = body[_MACHINE.size :]
-    acted = _rows(body[_MACHINE.size + sizes[kind] :])
-    state = codes = zeros = None
-    if kind == 1:
-        state = np.frombuffer(measured, "<f8", NUM_STATE).astype(np.float64)
-    elif kind == 2:
-        zeros = np.frombuffer(measured, "<f8", NUM_LEGS).astype(np.float64)
-        read = np.frombuffer(measured, "<i4", NUM_LEGS * samples, 8 * NUM_LEGS)
-        codes = read.astype(np.int32).reshape(samples, NUM_LEGS)
-    identity = _identity(measured) if kind == _OFFERS else None
-    finite = np.all(np.isfinite(acted)) and (zeros is None or np.all(np.isfinite(zeros)))
-    _demand(bool(finite), "a torque or an angle that is not finite")
-    own = {name: n[name] for name in n.keys() & MachineMessage.__annotations__.keys()}
-    own |= {"head": head, "flags": MachineFlags(flags), "acted": acted, "state": state}
-    own |= {"codes": codes, "zeros": zeros, "identity": identity, "cranks": n["content"] == _CRANKS}
-    own["reason"] = Reason(Fault(n["fault"]), n["leg"], n["lasted"])
-    own["before"] = Reason(Fault(n["before"]), 0, n["before_lasted"])
-    return MachineMessage(**own)
+def in_c(head: Head) -> Any:
+    """Return a `stewart_head *`."""
+    return core().ffi.new("stewart_head *", vars(head))
 
 
-def _identity(data: bytes) -> Identity:
-    parts = []
-    for digest, padded in _PART.iter_unpack(data[:_IDENTITY]):
-        name = padded.rstrip(b"\0")
-        _demand(all(0x20 <= letter <= 0x7E for letter in name), "a name that cannot be printed")
-        parts.append(Part(digest, name.decode("ascii")))
-    return Identity(*parts)
+def _machine(head: Head, read: Any) -> MachineMessage:
+    lib, reason, before = core().lib, read.reason, read.before
+    codes = _array(read.codes, np.int32)[: read.samples]
+    is_state, is_codes = read.kind == lib.STEWART_STATE, read.kind == lib.STEWART_ENCODERS
+    return MachineMessage(
+        head,
+        MachineFlags(read.head.flags),
+        **{name: getattr(read, name) for name in _MACHINE},
+        acted=_array(read.acted)[: read.history],
+        state=_array(read.state) if is_state else None,
+        codes=codes if is_codes else None,
+        zeros=_array(read.zeros) if is_codes else None,
+        identity=_identity(read.identity) if read.kind == lib.STEWART_OFFER else None,
+        reason=Reason(Fault(reason.fault), reason.leg, reason.lasted),
+        before=Reason(Fault(before.fault), 0, before.lasted),
+        cranks=read.content == lib.STEWART_CRANKS,
+    )
 
 
-def _controller(head: Head, flags: int, body: bytes) -> ControllerMessage:
-    _demand(len(body) >= _CONTROLLER.size, "a short body")
-    rows, content, sampled, playout, begin = _CONTROLLER.unpack_from(body)
-    asks, told = content == _REQUEST, body[_CONTROLLER.size :]
-    plausible = rows <= MOST_ROWS and content <= _CRANKS and flags <= 3 and not any(body[2:4])
-    _demand(plausible and not (asks and rows), "a number outside its range")
-    if asks:
-        _demand(told[_IDENTITY:] == _PADDING, "a request of another length")
-        torques, identity = _rows(b""), _identity(told)
-    else:
-        _demand(len(told) == 8 * NUM_TORQUES * rows, "a body of another length")
-        torques, identity = _rows(told), None
-    _demand(bool(np.all(np.isfinite(torques))), "a torque that is not finite")
-    _demand(rows == 0 or begin != NEVER, "torques for no run")
-    times, cranks = (sampled, playout, begin), content == _CRANKS
-    return ControllerMessage(head, ControllerFlags(flags), *times, torques, identity, cranks)
+def _controller(head: Head, read: Any) -> ControllerMessage:
+    lib, flags = core().lib, ControllerFlags(read.head.flags)
+    torques = _array(read.torques)[: read.rows]
+    identity = _identity(read.identity) if read.content == lib.STEWART_REQUEST else None
+    times, cranks = (read.sampled, read.playout, read.begin), read.content == lib.STEWART_CRANKS
+    return ControllerMessage(head, flags, *times, torques, identity, cranks)
 
 
-def _rows(data: bytes) -> Array:
-    return np.frombuffer(data, "<f8").astype(np.float64).reshape(-1, NUM_TORQUES)
+def _array(values: Any, kind: Any = np.float64) -> NDArray[Any]:
+    """Return a copy of an array of numbers (n,), or of rows (n, 6)."""
+    ffi = core().ffi
+    found = np.frombuffer(ffi.buffer(values), kind).copy()
+    return found if ffi.typeof(values).item.kind == "primitive" else found.reshape(-1, NUM_TORQUES)
+
+
+def _identity(read: Any) -> Identity:
+    ffi = core().ffi
+    parts = ((ffi.buffer(one.digest)[:], ffi.string(one.name).decode()) for one in read.parts)
+    return Identity(*(Part(digest, name) for digest, name in parts))

@@ -23,7 +23,7 @@ from stewart_drake.files.yamlio import brief
 from stewart_drake.law.servos import Stiffness, rise
 from stewart_drake.live.contact import parse_address
 from stewart_drake.live.endpoint import Address, Endpoint, now, read_key
-from stewart_drake.live.machine import Machine, check_scenario
+from stewart_drake.live.machine import DRIVES, Machine, check_scenario
 from stewart_drake.live.options import MachineOptions
 from stewart_drake.live.protocol import (
     NEVER,
@@ -310,7 +310,7 @@ class RobotMachine(Machine):
         body = (lambda: robot), "the robot"
         super().__init__(experiment, endpoint, settings, say, body=body, **kwargs)
         self._queue = np.empty((0, NUM_LEGS))
-        self._at(-self._ahead % self.period, 4, self._drive)
+        self._at(-self._ahead % self.period, DRIVES, self._drive)
 
     def _new_motors(self) -> Motors:
         return Motors(math.inf, self.period, cranks=True)
@@ -334,7 +334,7 @@ class RobotMachine(Machine):
 
     def _drive(self, time: int) -> None:
         """Send the setpoint of a period."""
-        self._at(time + self.period, 4, self._drive)
+        self._at(time + self.period, DRIVES, self._drive)
         while self._daemon.lines:
             self._report(time, self._daemon.lines.popleft())
         if not self._daemon.ready:

@@ -54,7 +54,7 @@ def report(
     Args:
         scenario: a Scenario, a shipped name or a path.
         settings: as `load_scenario` takes them.
-        controller: replaces the scenario's own, see `reporting.report.collect`.
+        controller: replaces the scenario's own in its run and the analyses; a name or a path.
 
     Raises:
         ConfigError: bad input.

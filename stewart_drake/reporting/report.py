@@ -138,12 +138,7 @@ def collect(
 ) -> ReportData:
     """Run and analyse a scenario on all cores. A reference out of reach is analysed only.
 
-    Args:
-        scenario_name: a Scenario, a shipped name or a path.
-        settings: as `load_scenario` takes them.
-        progress: called for every finished run or analysis.
-        controller: replaces the scenario's own in its run and the analyses; a shipped name or a
-            path.
+    The arguments are those of `sd.report`; `progress` is called for every finished run or analysis.
 
     Raises:
         ConfigError: bad input.

@@ -61,7 +61,7 @@ Progress = Callable[[str, float, float], None]
 
 _Systems = Mapping[str, Callable[[], System]]
 _NO_KEY: Final = re.compile(r"[^A-Za-z0-9_+-]")
-_POLL = 0.1
+_POLL: Final = 0.1
 """Interval of progress reports, s."""
 
 

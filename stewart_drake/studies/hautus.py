@@ -1,18 +1,12 @@
-"""The Hautus test on every model that a controller of the platform is designed with.
+"""The Hautus test (theory.md, section 21) on every model that a controller is designed with.
 
 Three families: the paper's error model (20)-(28), continuous; the same sampled and with the torques
 in flight, for every delay, as the minimal chain and as the paper's (37)-(39), which carries one
 torque more; and the true plant, linearised at rest. All are scaled so that the motion, and the
 torques it takes, have size 1, see `assess`.
 
-*The test* of Popov, Belevitch and Hautus is by smallest singular values. (A, B) is controllable if
-and only if [lambda I - A, B] has full row rank for every eigenvalue lambda of A; stabilisable, if
-for every one on or outside the stability boundary. The smallest singular value measures the
-distance from failure. The controllability matrix does not: the powers of A in it lose all digits
-beyond a few states. (A, C) is observable or detectable if (A', C') is controllable or stabilisable.
-
-A left null vector w of the pencil, w' A = lambda w', w' B = 0, is a combination of states that the
-input does not change. Its transposed counterpart is a motion that no output shows.
+The smallest singular value measures the distance from failure. The controllability matrix does not:
+the powers of A in it lose all digits beyond a few states.
 """
 
 from dataclasses import dataclass

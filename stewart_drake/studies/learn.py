@@ -1,22 +1,9 @@
-"""Learning a torque, or setpoints, from repetitions of a motion.
+"""Learning a torque, or setpoints, from repetitions of a motion (theory.md, section 43).
 
-Each repetition simulates the scenario for some periods of its motion.
-
-*Torques.* From the states x_k at the samples and the torques u_k that acted between them follows
-the torque d_k that the model lacks: with f the prediction of the model, with the parameters
-estimated in the last period, the rates are those of
-
-    x_{k+1} = f(x_k, u_k + d_k).
-
-The fit of -d_k by harmonics of the motion has coefficients g(c), where c are those of the learned
-torque in the repetition.
-
-*Setpoints.* A position servo whose velocity gain and damping are k_v, over its stiffness k, follows
-its setpoint late by tau = k_v / k. With e_k the crank angles that the motion lacks at the samples,
-the fit of e_k has coefficients e(c), and g(c) = c + e(c) + tau e'(c), e' those of the derivative.
-
-*Both.* Without a model error that depends on the motion g would not depend on c,
-and g(c) would be right at once. In general c = g(c) is solved by Anderson's method (theory.md).
+Each repetition simulates the scenario for some periods of its motion. What the model or the cranks
+lacked in the last period is fitted by harmonics of the motion. From the fit follow the coefficients
+g(c) of a learned signal that would have made up for it, where c are those that were used.
+`Anderson` solves c = g(c).
 """
 
 import itertools
@@ -375,6 +362,7 @@ class Lessons:
     def __init__(self, scenario: Scenario) -> None:
         self.period, servo = motion_period(scenario), scenario.actuator
         self._harmonics = harmonics_below(self.period, scenario.controller.period)
+        # Half as many again as there are coefficients.
         self.least = math.ceil(1.5 * (1 + 2 * self._harmonics))
         self.lag = servo.lag if servo.kind == "position_servo" else None
         self.errors: list[float] = []

@@ -1,24 +1,20 @@
-"""Training of the tuner's network on a data set, with one of two losses.
+"""Training of the tuner's network on a data set, with one of two losses (theory.md, 23 and 34).
 
 theta holds W1 (h, 18), b1 (h,), W2 (2, h), b2 (2,) one after the other, and the network is
 
     f(theta, u) = W2 sigmoid(W1 u + b1) + b2.
 
 *Labels* are the right answers; f minimises 1/2 sum |f(theta, u_i) - y_i|^2 by Levenberg and
-Marquardt, as in the paper: (J'J + lambda D^2) step = -J' r, which MINPACK solves through QR.
+Marquardt, as in the paper. K of (43) depends on w_Q / w_R alone, since P of (44) scales with both:
+pairs of one ratio are one gain, and a best gain has w_Q w_R = 1.
 
-K of (43) depends on w_Q / w_R alone, since P of (44) scales with both. Pairs of one ratio are
-therefore one gain, and (0.1, 0.1), (1, 1) and (4, 4) one answer; a best gain has w_Q w_R = 1.
-
-*Regret* is the cost of an answer. With R_i(r) = log J_i(r) - min log J_i along
-r = log10(w_Q / w_R), known at 13 ratios and linear in between, f minimises by Adam
+*Regret* R_i(r) = log J_i(r) - min log J_i is the cost of an answer along r = log10(w_Q / w_R),
+known at 13 ratios and linear in between. f minimises by Adam
 
     mean over rows of R_i(r(u; theta)) + OUTSIDE |r - nearest in bounds|^2 + DECAY mean theta^2.
 
-Where all ratios are equal, labels are noise and regrets are 0. Rows are first those of the runs
-with fixed ratios. A network leads to features that no fixed ratio does: in a second round half of
-the rows are of runs with the network. Excluded conditions, and with them motions, decide when to
-stop, and which round was better, in the loop.
+Rows are first those of the runs with fixed ratios, in a second round half of them are of runs with
+the network. Excluded conditions decide when to stop, and which round was better, in the loop.
 """
 
 import json
