@@ -24,7 +24,6 @@ from stewart_drake.core.layout import (
     DEAD_CENTRE_SINE,
     GEOMETRY,
     LEG_NUMBERS,
-    SHAPES,
 )
 from stewart_drake.mechanism.geometry import Mechanism, geometry_of
 from stewart_drake.scenario.signals import (
@@ -33,6 +32,7 @@ from stewart_drake.scenario.signals import (
     COULOMB_SPEED,
     DAMPING,
     NUM_LEGS,
+    NUM_PLANT_PARAMETERS,
     PAYLOAD,
     PAYLOAD_POSITION,
     WRENCH,
@@ -431,7 +431,9 @@ def solve_symmetric(matrix: ca.SX, right: ca.SX) -> ca.SX:
 
 def symbols() -> dict[str, ca.SX]:
     """Return new symbols for all arguments of the equations."""
-    return {name: ca.SX.sym(name, *shape) for name, shape in SHAPES.items()}
+    six = ("pose", "rates", "accelerations", "torque", "angles")
+    sizes = dict.fromkeys(six, 6) | {"parameters": NUM_PLANT_PARAMETERS, "gravity": 1}
+    return {name: ca.SX.sym(name, size) for name, size in sizes.items()}
 
 
 def leg_measures(
