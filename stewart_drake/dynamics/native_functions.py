@@ -6,12 +6,10 @@ from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import OpenBLASController, threadpool_limits
 
 from stewart_drake.core.layout import MEASURES
 from stewart_drake.core.library import core
-from stewart_drake.mechanism.clearance import LINK_PAIRS, link_radii
 from stewart_drake.mechanism.geometry import Mechanism, geometry_of
 from stewart_drake.mechanism.kinematics import angle_rate_map
 from stewart_drake.scenario.signals import (
@@ -36,10 +34,8 @@ class NativeFunctions:
     """
 
     def __init__(self, mechanism: Mechanism) -> None:
-        self._core, numbers = core(), geometry_of(mechanism)
-        self._geometry = self._core.at(numbers)
-        self._links = np.array(LINK_PAIRS, np.intc)
-        self._radii, self._unit = link_radii(mechanism), mechanism.crank_lengths.min()
+        self._core = core()
+        self._geometry = self._core.at(geometry_of(mechanism))
 
     def _call(self, name: str, arguments: Sequence[ArrayLike], *shapes: tuple[int, ...]) -> Any:
         c, copies = self._core, [np.array(one, np.float64) for one in arguments]
@@ -127,17 +123,6 @@ class NativeFunctions:
         first, limits = c.at(rows), c.at(least)
         number = range(0, rows.size, NUM_TORQUES)
         return np.array([function(self._geometry, first + i, sign, limits) for i in number])
-
-    def room(self, poses: Array, pairs: NDArray[np.intp], least: Array) -> Array:
-        """Return reach margins and clearances (n, 6 + k) of poses (n, 6) above `least` (6 + k,).
-
-        All are in shortest cranks; `pairs` (k,) are indices in `clearance.LINK_PAIRS`.
-        """
-        rows, links = np.array(poses, np.float64), self._links[pairs]
-        room = np.empty((len(rows), len(least)))
-        given = self._geometry, len(rows), rows, len(links), links, self._radii, self._unit
-        self._core.call("room", *given, least, room)
-        return room
 
     def many_steps(
         self, state: ArrayLike, torques: Array, parameters: Array, gravity: float, h: Array

@@ -261,21 +261,13 @@ def plate_radius(mechanism: kinematics.Legs) -> float:
 
 
 def geometry_of(mechanism: Mechanism) -> Array:
-    """Return the numbers of a machine as the core takes them, see `core.layout`.
-
-    Leg by leg within each number: lengths of crank and rod, branch, R_WS by columns, p_PQ, p_WS,
-    friction at crank tip and plate joint.
-    Then mass and inertia of the plate; mass, centre and inertia about the motor axis of the crank;
-    mass, centre and inertia of the rod; the plate's mean radius.
-    """
+    """Return the numbers of a machine as the core takes them, see `core.layout`."""
     m = mechanism
-    R_WS = m.R_WS.transpose(0, 2, 1).reshape(NUM_LEGS, 9)
-    lengths = m.crank_lengths, m.rod_lengths, m.branches
-    legs = np.column_stack([*lengths, R_WS, m.p_PQ, m.p_WS, m.ball_joints.T])
+    legs = *kinematics.numbers_of(m), *m.ball_joints.ravel()
     crank = [m.crank.mass, m.crank.center, m.crank.inertia[2]]
     rod = [m.rod.mass, m.rod.center, *m.rod.inertia]
     plate = [m.plate.mass, *m.plate.inertia]
-    return np.array([*legs.T.ravel(), *plate, *crank, *rod, plate_radius(m)])
+    return np.array([*legs, *plate, *crank, *rod, plate_radius(m)])
 
 
 def fingerprint(mechanism: Mechanism) -> str:
