@@ -25,7 +25,6 @@ from stewart_drake.law.cost import QuadraticCost
 from stewart_drake.law.feedforward import InverseDynamicsFeedforward
 from stewart_drake.law.nominal import DesignModel
 from stewart_drake.law.observers import CoreObserver
-from stewart_drake.mechanism.geometry import geometry_of
 
 RUNS = 6
 REPEATS = 300
@@ -142,7 +141,7 @@ def evaluations() -> list[list[str]]:
     dynamics.accelerations(pose, rates, torque)
     compiled, theta = dynamics._functions.accelerations, plant_parameters(dynamics.parameters)
     c, gravity = core(), np.array(dynamics.gravity)
-    arrays = geometry_of(mechanism), theta, gravity, pose, rates, torque, np.empty(6)
+    arrays = mechanism.numbers, theta, gravity, pose, rates, torque, np.empty(6)
     *of_plant, at_pose, at_rates, at_torque, result = map(c.at, arrays)
     places = c.plant(*of_plant), at_pose, at_rates, at_torque, result
     calls: dict[str, Callable[[], object]] = {

@@ -25,7 +25,7 @@ from stewart_drake.core.layout import (
     GEOMETRY,
     LEG_NUMBERS,
 )
-from stewart_drake.mechanism.geometry import Mechanism, geometry_of
+from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.signals import (
     BIAS,
     COULOMB,
@@ -71,9 +71,7 @@ class CommonNumbers(NamedTuple):
 
 def numbers_of(mechanism: Mechanism) -> tuple[list[LegNumbers], CommonNumbers]:
     """Return the numbers of a machine."""
-    legs, common = ca.vertsplit(
-        ca.DM(geometry_of(mechanism)), [0, NUM_LEGS * LEG_NUMBERS, GEOMETRY]
-    )
+    legs, common = ca.vertsplit(ca.DM(mechanism.numbers), [0, NUM_LEGS * LEG_NUMBERS, GEOMETRY])
     by_leg = ca.horzsplit(ca.reshape(legs, NUM_LEGS, LEG_NUMBERS).T)
     return [leg_numbers(one) for one in by_leg], common_numbers(common)
 

@@ -10,7 +10,7 @@ from threadpoolctl import OpenBLASController, threadpool_limits
 
 from stewart_drake.core.layout import MEASURES
 from stewart_drake.core.library import core
-from stewart_drake.mechanism.geometry import Mechanism, geometry_of
+from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import angle_rate_map
 from stewart_drake.scenario.signals import (
     ACCELERATIONS,
@@ -35,7 +35,7 @@ class NativeFunctions:
 
     def __init__(self, mechanism: Mechanism) -> None:
         self._core = core()
-        self._geometry = self._core.at(geometry_of(mechanism))
+        self._geometry = self._core.at(mechanism.numbers)
 
     def _call(self, name: str, arguments: Sequence[ArrayLike], *shapes: tuple[int, ...]) -> Any:
         c, copies = self._core, [np.array(one, np.float64) for one in arguments]

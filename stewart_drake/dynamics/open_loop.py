@@ -14,7 +14,6 @@ import numpy as np
 from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import LEAST, Failure, diagnose, home_sign
-from stewart_drake.mechanism.geometry import geometry_of
 from stewart_drake.scenario.signals import NUM_STATE, POSE, WRENCH
 from stewart_drake.types import Array, ArrayLike
 
@@ -56,7 +55,7 @@ class NativePlant:
         c, mechanism = core(), dynamics.mechanism
         self._mechanism = mechanism
         self.states = np.empty((len(times), NUM_STATE))
-        numbers = geometry_of(mechanism), dynamics.plant_parameters, dynamics.gravity
+        numbers = mechanism.numbers, dynamics.plant_parameters, dynamics.gravity
         copies = [np.array(one, np.float64) for one in numbers]
         self.wrench = copies[1][WRENCH]
         plant = c.plant(*map(c.at, copies))

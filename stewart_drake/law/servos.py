@@ -125,7 +125,7 @@ class PositionServo:
         """Return torques (2, 6) in N m, without and within the limit.
 
         Args:
-            geometry: numbers of the machine, `mechanism.geometry.geometry_of`.
+            geometry: numbers of the machine, `Mechanism.numbers`.
             setpoint: (6,) crank angles, rad.
             state: (12,) pose and rates.
         """

@@ -46,7 +46,6 @@ from stewart_drake.loop.learned import learned_signal
 from stewart_drake.loop.own import NOTHING
 from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.sampling import SteppedLaw, update_every, weak
-from stewart_drake.mechanism.geometry import geometry_of
 from stewart_drake.mechanism.trajectories import (
     RESTING,
     SAME,
@@ -199,7 +198,7 @@ class PositionServos(LeafSystem):
         reports: ReportLayout,
     ) -> None:
         super().__init__()
-        self._geometry = geometry_of(dynamics.mechanism)
+        self._geometry = dynamics.mechanism.numbers
         self._first = fixed("command", command, (NUM_REFERENCE,))
         self._servo, self.reports = servo, reports
         self._part = positive("period", period) / reports.parts
