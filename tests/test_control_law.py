@@ -31,8 +31,8 @@ from stewart_drake.loop.law_design import control_law
 from stewart_drake.loop.preparation import prepare, prepare_unchecked
 from stewart_drake.mechanism.assembly import torque_map
 from stewart_drake.mechanism.trajectories import evaluate, make_reference
-from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.scenario.timing import Delay
 from tests.backends import Predicted
 from tests.mechanisms import PAPER
 from tests.oracles import relative

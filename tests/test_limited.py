@@ -13,8 +13,17 @@ from stewart_drake.law.belief import Belief, Estimate
 from stewart_drake.law.clear_space import ClearSpace
 from stewart_drake.law.coverage import uncovered_part
 from stewart_drake.law.feedforward import GAUSS_NODES, InverseDynamicsFeedforward, mean_torques
-from stewart_drake.law.horizon import HoldModel, HorizonCost, condense, pose_root, riccati
-from stewart_drake.law.horizon_qp import NEAR, QpError, problem_of, solve_by_daqp
+from stewart_drake.law.horizon import (
+    NEAR,
+    HoldModel,
+    HorizonCost,
+    QpError,
+    condense,
+    pose_root,
+    problem_of,
+    riccati,
+    solve_by_daqp,
+)
 from stewart_drake.law.least_error import LEAST_ERROR_SHARE
 from stewart_drake.law.limited import LimitedLqi
 from stewart_drake.law.nominal import NominalPlant, TorqueLimit
@@ -28,8 +37,8 @@ from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.kinematics import reach_margins
 from stewart_drake.mechanism.trajectories import evaluate, rows_along
 from stewart_drake.reporting.run import run_document
-from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.scenario.timing import Delay
 from tests.oracles import capsule_clearances, central_difference
 
 ON = ("plant.kind=exact", "start=on_reference", "queue=reference")

@@ -10,7 +10,7 @@ from stewart_drake.law.delay_model import ContinuousModel
 from stewart_drake.law.stability import LinearLoop, loop_gain, sensitivity, spectral_radius
 from stewart_drake.loop.controller_margin import controller_margin, loop_at, state_spaces
 from stewart_drake.loop.preparation import prepare
-from stewart_drake.scenario.delay import Delay
+from stewart_drake.scenario.timing import Delay
 
 OMEGA = np.geomspace(0.05, 30, 40)
 

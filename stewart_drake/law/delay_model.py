@@ -24,8 +24,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import expm
 
-from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import NUM_COORDINATES, NUM_STATE, POSE, RATES
+from stewart_drake.scenario.timing import Delay
 from stewart_drake.types import Array
 
 

@@ -35,11 +35,14 @@ from stewart_drake.law.horizon import (
     HoldModel,
     HorizonCost,
     Plan,
+    QpError,
+    Solver,
     condense,
     pose_root,
+    problem_of,
     riccati,
+    solve_by_daqp,
 )
-from stewart_drake.law.horizon_qp import QpError, Solver, problem_of, solve_by_daqp
 from stewart_drake.law.memory import Memory
 from stewart_drake.law.motion import Motion, Preview
 from stewart_drake.law.nominal import NominalPlant, TorqueLimit

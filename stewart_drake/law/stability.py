@@ -29,7 +29,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from stewart_drake.law.delay_model import ContinuousModel, DelayedModel, delayed_model
-from stewart_drake.scenario.delay import Delay
+from stewart_drake.scenario.timing import Delay
 from stewart_drake.types import Array, Complex
 
 SLOWEST_POLE: Final = 1e-3

@@ -27,7 +27,7 @@ from stewart_drake.law.coverage import backend, uncovered_part
 from stewart_drake.law.motion import KnownMotion
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.sensing import Measurement
-from stewart_drake.law.servo_preview import ServoPreview
+from stewart_drake.law.servos import ServoPreview
 from stewart_drake.loop.law_design import (
     catch_up_of,
     compose_law,

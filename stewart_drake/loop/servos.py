@@ -28,12 +28,12 @@ from stewart_drake.law.learned import with_learned
 from stewart_drake.law.nominal import TorqueLimit
 from stewart_drake.law.observers import CoreObserver
 from stewart_drake.law.predictive_lqi import PredictiveLqi
-from stewart_drake.law.servo_preview import ServoPreview
 from stewart_drake.law.servos import (
     PositionServo,
     ReportLayout,
     Segment,
     ServoLoop,
+    ServoPreview,
     Stiffness,
     crank_mobility,
     mean_inertia,
@@ -56,7 +56,6 @@ from stewart_drake.mechanism.trajectories import (
     spread_instants,
 )
 from stewart_drake.scenario.config import Scenario, compatible_actuator
-from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import (
     ACCELERATIONS,
     MODEL_TORQUE,
@@ -67,7 +66,7 @@ from stewart_drake.scenario.signals import (
     RATES,
     SETPOINT,
 )
-from stewart_drake.scenario.timing import servo_ticks, servo_time
+from stewart_drake.scenario.timing import Delay, servo_ticks, servo_time
 from stewart_drake.types import Array
 
 
