@@ -26,9 +26,9 @@ a period. To follow a_r, whose motion takes the torque tau_r with friction and a
 
 taken in the middle of the hold: a motion within it deviates from its mean by the second order.
 
-The law, `ServoPreview`, sends the crank angles of the reference ahead (core/servo.h). Until a command
-is reached, servos by bandwidth move to it from the one before (`Segment`). Without T_ff they need an
-error to produce the torque of the motion. Servos by stiffness hold (setpoint).
+The law, `ServoPreview`, sends the crank angles of the reference ahead (core/servo.h). Until a
+command is reached, servos given by their bandwidth move to it from the one before (`Segment`).
+Without T_ff they need an error to produce the torque of the motion.
 """
 
 import math
