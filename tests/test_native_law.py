@@ -492,7 +492,7 @@ def test_memory_that_was_never_started_gives_zeros(settings, value):
     y, rows = experiment.start.copy(), np.zeros((len(law.preview_times), 18))
     sample = c.ffi.new("stewart_sample *", {"measurement": c.at(y), "context": c.at(rows)})
     sample.reference, sample.weights = c.lib.stewart_given_rows, [1.0, 1.0]
-    memory, scratch = np.full(compiled.data.memory, value), np.zeros(100_000)
+    memory, scratch = np.full(compiled.torques_law.memory, value), np.zeros(100_000)
     before, output = memory.copy(), np.full(18 if servos else 6, np.nan)
     given = c.at(memory), c.at(scratch), sample
     if servos:

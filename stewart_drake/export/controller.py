@@ -190,9 +190,9 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
         "configuration": Constants(
             compiled.keep_alive, core().symbols, suffix, compiled.data[0], "stewart_law"
         ),
-        "memory": compiled.data.memory,
+        "memory": compiled.torques_law.memory,
         "scratch": compiled.scratch,
-        "sizes": compiled.data.law if servos else compiled.data,
+        "sizes": compiled.torques_law,
         "tuner": None,
         "least": LEAST,
         "home_sign": home_sign(experiment.mechanism),
