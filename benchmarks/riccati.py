@@ -14,8 +14,8 @@ from scipy.linalg import solve_discrete_are
 
 import stewart_drake as sd
 from stewart_drake.law.delay_model import (
-    ChainModel,
     DelayedModel,
+    LinearModel,
     chain,
     delayed_model,
     double_integrators,
@@ -60,7 +60,7 @@ def by_drake(A: Array, B: Array, Q: Array, R: Array) -> Array:
     return solution
 
 
-def gain(system: ChainModel, P: Array) -> Array:
+def gain(system: LinearModel, P: Array) -> Array:
     """Return (44)."""
     return np.linalg.solve(R + system.B.T @ P @ system.B, system.B.T @ P @ system.A)
 

@@ -11,7 +11,7 @@ from scipy.linalg import expm
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.delay_model import (
-    ContinuousModel,
+    LinearModel,
     chain,
     delayed_model,
     double_integrators,
@@ -41,7 +41,7 @@ def continuous_models(draw):
         A = np.triu(A, 1)
     elif kind == "zero":
         A = np.zeros((n, n))
-    return ContinuousModel(A, rng.normal(0, 1, (n, m)), rng.normal(0, 1, (p, n)))
+    return LinearModel(A, rng.normal(0, 1, (n, m)), rng.normal(0, 1, (p, n)))
 
 
 def platforms():

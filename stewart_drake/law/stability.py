@@ -28,7 +28,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from stewart_drake.law.delay_model import ContinuousModel, DelayedModel, delayed_model
+from stewart_drake.law.delay_model import DelayedModel, LinearModel, delayed_model
 from stewart_drake.scenario.timing import Delay
 from stewart_drake.types import Array, Complex
 
@@ -126,7 +126,7 @@ def closed_loop(plant: DelayedModel, K: Array, gain: float = 1.0) -> Array:
 class LinearLoop:
     """True plant with the linearised law."""
 
-    plant: ContinuousModel  # the true one, without integral states
+    plant: LinearModel  # the true one, without integral states
     K: Array  # (m, n + m L) of (law)
     period: float  # s
     delay: Delay  # the true one

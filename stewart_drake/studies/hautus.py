@@ -33,7 +33,7 @@ from threadpoolctl import threadpool_limits
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import SINGULARITY_LIMIT, Failure, diagnose, measures_at
 from stewart_drake.law.delay_model import (
-    ContinuousModel,
+    LinearModel,
     chain,
     delayed_model,
     double_integrators,
@@ -324,12 +324,12 @@ def study_hautus(scenario: Scenario) -> HautusStudy:
         return study
 
 
-def _error_models(found: Assessment, model: ContinuousModel) -> list[System]:
+def _error_models(found: Assessment, model: LinearModel) -> list[System]:
     """Test the continuous model, and delay chains of it and of the plant under gravity."""
     delay, period = found.experiment.scenario.delay, found.experiment.scenario.controller.period
     systems = [_test(found, "error model, continuous", "error model", with_integral(model))]
     heavy = _linearized(found, True, found.experiment.mechanism.home)
-    families: list[tuple[str, ContinuousModel | str, bool]] = [
+    families: list[tuple[str, LinearModel | str, bool]] = [
         ("minimal chain", model, False),
         ("paper's chain", model, True),
         ("chain under gravity", heavy, False),
@@ -340,14 +340,14 @@ def _error_models(found: Assessment, model: ContinuousModel) -> list[System]:
         for steps in range(LONGEST + 1):
             sampled = delayed_model(continuous, period, steps, delay.fraction, integral=True)
             augmented = chain(sampled, always_extra=extra)
-            discrete = ContinuousModel(augmented.A, augmented.B, augmented.C)
+            discrete = LinearModel(augmented.A, augmented.B, augmented.C)
             systems.append(
                 _test(found, f"{family}, mu = {steps}", family, discrete, steps, period=period)
             )
     return systems
 
 
-def _linearized(found: Assessment, gravity: bool, pose: Array) -> ContinuousModel | str:
+def _linearized(found: Assessment, gravity: bool, pose: Array) -> LinearModel | str:
     """Return the plant held still at a pose (6,), or why it cannot be."""
     mechanism = found.experiment.mechanism
     reason = _unusable(diagnose(mechanism, 0.0, pose))
@@ -372,7 +372,7 @@ def _test(
     found: Assessment,
     name: str,
     family: str,
-    model: ContinuousModel,
+    model: LinearModel,
     steps: int | None = None,
     time: float | None = None,
     gravity: bool | None = None,
