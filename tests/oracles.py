@@ -22,6 +22,7 @@ Nothing of the closed-form equations is used: only the SDFormat file is common t
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -281,6 +282,13 @@ def lqr_by_drake(A, B, Q, R):
     if not (residual <= 1e-4 * size and np.abs(np.linalg.eigvals(closed)).max() < 1):
         raise RiccatiError("Drake's solver did not solve it")
     return K, P
+
+
+def augmented_gain_by_drake(model, Q, R):
+    """Return `augmented_gain` for any numbers of states and torques."""
+    free = chain(replace(model, steps=0))
+    K, _ = lqr_by_drake(free.A, free.B, free.C.T @ Q @ free.C, R)
+    return K @ prediction_matrix(model)
 
 
 def full_gain(model, Q, R):

@@ -169,25 +169,24 @@ def delayed_model(
     return DelayedModel(A, B_old, B_new, C, steps, fraction)
 
 
-def chain(model: DelayedModel, *, always_extra: bool = False) -> LinearModel:
+def chain(model: DelayedModel, carried: int = 0) -> LinearModel:
     """Return the delay chain (37)-(39) as one undelayed system of [e; queue, oldest torque first].
 
     Args:
-        always_extra: carry T_{k-mu-1} also when eta0 = 0, as the paper does.
+        carried: torques in the queue, if more than are in flight; the paper always has mu + 1.
     """
     n, m = model.B_new.shape
-    extra = always_extra or model.fraction > 0
-    length = model.steps + int(extra)
-    if length == 0:
-        return LinearModel(model.A, model.B_new, model.C)
-    A = np.zeros((n + m * length, n + m * length))
-    B = np.zeros((n + m * length, m))
+    length = max(model.queue_length, carried)
+    A, B = np.zeros((n + m * length, n + m * length)), np.zeros((n + m * length, m))
     A[:n, :n] = model.A
-    torques = [*([model.B_old] if extra else []), model.B_new]  # oldest first; the last may be T_k
-    for place, B_of_torque in enumerate(torques):
-        columns = A[:n, n + m * place :] if place < length else B[:n]
-        columns[:, :m] += B_of_torque
-    A[n : n + m * (length - 1), n + m :] = np.eye(m * (length - 1))
-    B[n + m * (length - 1) :] = np.eye(m)
+    if length:
+        A[n:-m, n + m :] = np.eye(m * (length - 1))
+        B[-m:] = np.eye(m)
+    for age, B_of_torque in ((model.steps + 1, model.B_old), (model.steps, model.B_new)):
+        if age == 0:  # acts at once
+            B[:n] += B_of_torque
+        elif age <= length:
+            place = n + m * (length - age)
+            A[:n, place : place + m] += B_of_torque
     C = np.hstack([model.C, np.zeros((model.C.shape[0], m * length))])
     return LinearModel(A, B, C)

@@ -339,8 +339,7 @@ def _error_models(found: Assessment, model: LinearModel) -> list[System]:
             continue  # the plant's own entry has the reason
         for steps in range(LONGEST + 1):
             sampled = delayed_model(continuous, period, steps, delay.fraction, integral=True)
-            augmented = chain(sampled, always_extra=extra)
-            discrete = LinearModel(augmented.A, augmented.B, augmented.C)
+            discrete = chain(sampled, steps + 1 if extra else 0)
             systems.append(
                 _test(found, f"{family}, mu = {steps}", family, discrete, steps, period=period)
             )
