@@ -10,6 +10,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from timeit import timeit
 from typing import Any
@@ -18,6 +19,7 @@ import numpy as np
 from _bench import table, with_own, write
 
 import stewart_drake as sd
+from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import plant_parameters
 from stewart_drake.law.cost import QuadraticCost
 from stewart_drake.law.feedforward import InverseDynamicsFeedforward
@@ -138,8 +140,12 @@ def evaluations() -> list[list[str]]:
     dynamics, pose, rates, torque = sd.StewartDynamics(mechanism), mechanism.home, *np.ones((2, 6))
     dynamics.accelerations(pose, rates, torque)
     compiled, theta = dynamics._functions.accelerations, plant_parameters(dynamics.parameters)
+    c, gravity = core(), np.array(dynamics.gravity)
+    arrays = mechanism.numbers, theta, gravity, pose, rates, torque, np.empty(6)
+    *of_plant, at_pose, at_rates, at_torque, result = map(c.at, arrays)
+    places = c.plant(*of_plant), at_pose, at_rates, at_torque, result
     calls: dict[str, Callable[[], object]] = {
-        "the function alone": compiled.own_buffers().evaluate,
+        "the function alone": partial(c.lib.stewart_accelerations, *places),
         "with its arguments": lambda: compiled(pose, rates, torque, theta, dynamics.gravity),
         "`StewartDynamics.accelerations`": lambda: dynamics.accelerations(pose, rates, torque),
     }

@@ -19,7 +19,7 @@ from pydrake.solvers import ClarabelSolver, MathematicalProgram, OsqpSolver, Sol
 import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law import limited
-from stewart_drake.law.horizon_qp import LeastDistance, solve_by_daqp
+from stewart_drake.law.horizon import LeastDistance, solve_by_daqp
 from stewart_drake.loop.bulk import Ending, run_in_bulk
 
 SEEDS = size("SEEDS", 8)

@@ -115,7 +115,7 @@ def dop853_run(motion: Motion, accuracy: float) -> Run:
     end, torque = np.array([motion.duration]), motion.torque(0.0)
 
     def run() -> tuple[float, Array]:
-        plant = NativePlant(dynamics, START, end, accuracy, np.inf)
+        plant = NativePlant(dynamics, START, end, accuracy)
         started = time.process_time()
         plant.hold([0.0], torque)
         return time.process_time() - started, plant.final

@@ -6,7 +6,7 @@ from stewart_drake.loop.link import DelayChain, LateMeasurements, PlayoutBuffer,
 from stewart_drake.loop.sensor import Encoders, Sensor
 from stewart_drake.loop.servos import PositionServos, Servos
 from stewart_drake.loop.tuner import AnnTuner, DensityWindow, LawTuner
-from stewart_drake.scenario.delay import Delay
+from stewart_drake.scenario.timing import Delay
 
 __all__ = [
     "AnnTuner",

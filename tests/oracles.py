@@ -22,10 +22,11 @@ Nothing of the closed-form equations is used: only the SDFormat file is common t
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.math import RollPitchYaw
+from pydrake.math import DiscreteAlgebraicRiccatiEquation, RollPitchYaw
 from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
@@ -39,9 +40,11 @@ from pydrake.multibody.tree import (
 from scipy.integrate import solve_ivp
 
 from stewart_drake.dynamics.stewart import plant_parameters
-from stewart_drake.law.riccati import prediction_matrix, reduced_gain
+from stewart_drake.law.delay_model import chain
+from stewart_drake.law.riccati import RiccatiError, prediction_matrix, reduced_gain
+from stewart_drake.mechanism.clearance import LINK_PAIRS, link_radii
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.mechanism.kinematics import UnreachablePoseError, leg_geometry
+from stewart_drake.mechanism.kinematics import UnreachablePoseError, dot, leg_geometry, legs_along
 from stewart_drake.mechanism.sdformat import to_sdformat
 from stewart_drake.scenario.signals import (
     ANGLES,
@@ -269,6 +272,31 @@ def augmented_gain(model, Q, R):
     return reduced_gain(model, Q, R) @ prediction_matrix(model)
 
 
+def lqr_by_drake(A, B, Q, R):
+    """Return K and P as `law.riccati.lqr`, for any numbers of states and torques."""
+    symmetric = (Q + Q.T) / 2, (R + R.T) / 2
+    P = DiscreteAlgebraicRiccatiEquation(*map(np.asfortranarray, (A, B, *symmetric)))
+    K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+    closed = A - B @ K
+    residual, size = np.linalg.norm(Q + A.T @ P @ closed - P), np.linalg.norm(P)
+    if not (residual <= 1e-4 * size and np.abs(np.linalg.eigvals(closed)).max() < 1):
+        raise RiccatiError("Drake's solver did not solve it")
+    return K, P
+
+
+def augmented_gain_by_drake(model, Q, R):
+    """Return `augmented_gain` for any numbers of states and torques."""
+    free = chain(replace(model, steps=0))
+    K, _ = lqr_by_drake(free.A, free.B, free.C.T @ Q @ free.C, R)
+    return K @ prediction_matrix(model)
+
+
+def full_gain(model, Q, R):
+    """Return (42)-(44) on the whole chain (37)-(39): K (m, n + m L) and P, with Q on y = C e."""
+    augmented = chain(model)
+    return lqr_by_drake(augmented.A, augmented.B, augmented.C.T @ Q @ augmented.C, R)
+
+
 def relative(value: Array, expected: Array) -> float:
     """Return the norm of the deviation over the norm of the expected value."""
     return float(np.linalg.norm(value - expected) / np.linalg.norm(expected))
@@ -316,3 +344,44 @@ def central_difference_linearization(
         central_difference(field(a, torque, parameters), state, step),
         central_difference(lambda u: field(a, u, parameters)(state), torque, step),
     )
+
+
+def center_lines(mechanism, poses, legs):
+    """Return the lines of cranks, then rods, at poses (n, 6) whose legs are `legs`.
+
+    These are the starts in W, m, and the vectors from there to the ends, (n, 12, 3).
+    """
+    cranks = mechanism.crank_lengths[:, None] * legs.crank
+    rods = mechanism.rod_lengths[:, None] * legs.rod
+    joints = poses[:, None, POSITION] + legs.p_PQ_W
+    shafts = np.broadcast_to(mechanism.p_WS, joints.shape)
+    return np.hstack([shafts, joints - rods]), np.hstack([cranks, rods])
+
+
+def segment_distances(p, u, q, v):
+    """Return distances (...) of the segments p + s u and q + t v, 0 <= s, t <= 1; arrays (..., 3).
+
+    |r + s u - t v|^2, r = p - q, is convex in (s, t). Over all s and t it is least where
+    s (u.u v.v - (u.v)^2) = (u.v)(v.r) - (u.r)(v.v). That s is cut to the segment, then the best t
+    for it, and then the best s for that t: if one of the three was cut, the minimum over the
+    square lies on its border, and these steps end there. Parallel lines have many minima, and s = 0
+    leads to one. Lengths are not zero.
+    """
+    r = p - q
+    uu, vv, uv = dot(u, u), dot(v, v), dot(u, v)
+    ur, vr = dot(u, r), dot(v, r)
+    area = uu * vv - uv**2
+    skew = area > 1e-14 * uu * vv
+    s = np.clip(np.where(skew, (uv * vr - ur * vv) / np.where(skew, area, 1.0), 0.0), 0.0, 1.0)
+    t = np.clip((uv * s + vr) / vv, 0.0, 1.0)
+    s = np.clip((uv * t - ur) / uu, 0.0, 1.0)
+    return np.sqrt(dot(d := r + s[..., None] * u - t[..., None] * v, d))
+
+
+def capsule_clearances(mechanism, poses):
+    """Return `mechanism.clearance.clearances` (n, 60) by these functions."""
+    first, second = np.transpose(LINK_PAIRS)
+    start, along = center_lines(mechanism, poses, legs_along(mechanism, poses))
+    lines = start[:, first], along[:, first], start[:, second], along[:, second]
+    radii = link_radii(mechanism)
+    return segment_distances(*lines) - radii[first] - radii[second]

@@ -26,8 +26,8 @@ from stewart_drake.scenario.calibration import (
     load_calibration,
     save_calibration,
 )
-from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import CONSTANTS, DAMPING, PARAMETERS, PAYLOAD, PLANT_PARAMETERS
+from stewart_drake.scenario.timing import Delay
 from tests.faults import one_line, written
 from tests.mechanisms import PAPER
 

@@ -15,10 +15,8 @@ from stewart_drake.mechanism.assembly import assemble
 from stewart_drake.mechanism.clearance import (
     LINK_PAIRS,
     LINKS,
-    center_lines,
     clearances,
     proportions,
-    segment_distances,
 )
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.kinematics import legs_along
@@ -26,6 +24,7 @@ from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.clearance import clearance_along, study_clearance
 from stewart_drake.studies.workspace_map import sections, travel
 from tests.mechanisms import PAPER, random_mechanism, random_pose
+from tests.oracles import center_lines, segment_distances
 from tests.screen import said, summary_in
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
@@ -171,7 +170,7 @@ def test_capsules_are_never_further_apart_than_the_links_in_them(seed):
     rng = np.random.default_rng(seed)
     mechanism = random_mechanism(rng)
     pose = random_pose(rng, mechanism)
-    low = clearances(mechanism, pose[None], legs_along(mechanism, pose[None]))[0]
+    low = clearances(mechanism, pose[None])[0]
     scene = ClearanceScene(mechanism, base=False)
     found = {frozenset(p): d for p, d in zip(scene.pairs, scene.distances(pose), strict=True)}
     for (i, j), least in zip(LINK_PAIRS, low, strict=True):

@@ -24,8 +24,8 @@ from stewart_drake.loop.bulk import run_in_bulk
 from stewart_drake.loop.controller_margin import controller_margin
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.simulation import simulate
-from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.scenario.timing import Delay
 from stewart_drake.studies.compare import ADAPTIVE, CONTROLLERS, shown
 from stewart_drake.studies.verdict import loop_verdict
 from tests.mechanisms import PAPER

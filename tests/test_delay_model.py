@@ -11,7 +11,7 @@ from scipy.linalg import expm
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.delay_model import (
-    ContinuousModel,
+    LinearModel,
     chain,
     delayed_model,
     double_integrators,
@@ -41,7 +41,7 @@ def continuous_models(draw):
         A = np.triu(A, 1)
     elif kind == "zero":
         A = np.zeros((n, n))
-    return ContinuousModel(A, rng.normal(0, 1, (n, m)), rng.normal(0, 1, (p, n)))
+    return LinearModel(A, rng.normal(0, 1, (n, m)), rng.normal(0, 1, (p, n)))
 
 
 def platforms():
@@ -103,7 +103,7 @@ def assert_chain_agrees(model, period, steps, fraction, integral, extra, rng):
     start = rng.normal(0, 1, n)
     errors, integrals = simulate_delayed(model, period, steps, fraction, start, torques)
     delayed = delayed_model(model, period, steps, fraction, integral=integral)
-    augmented = chain(delayed, always_extra=extra)
+    augmented = chain(delayed, steps + 1 if extra else 0)
     length = steps + (1 if extra or fraction > 0 else 0)
     size = n + (len(model.C) if integral else 0)
     assert augmented.A.shape == (size + m * length, size + m * length)
@@ -171,7 +171,7 @@ def test_chain_of_the_platform_is_its_delayed_system(name, steps, fraction, extr
 def test_chain_has_the_blocks_that_the_paper_prints(steps, fraction):
     """(35) and (39), with their zero blocks at the sizes that fit."""
     model = platforms()["gravity"]
-    found = chain(delayed_model(model, 0.1, steps, fraction, integral=False), always_extra=True)
+    found = chain(delayed_model(model, 0.1, steps, fraction, integral=False), steps + 1)
     N, n, dt, eta0 = 12, 6, 0.1, 0.1 * fraction
 
     def integral(start, end):
@@ -197,7 +197,7 @@ def test_chain_has_the_blocks_that_the_paper_prints(steps, fraction):
 
 def test_the_papers_extra_block_is_seen_by_nothing_without_a_fraction():
     delayed = delayed_model(platforms()["paper"], 0.1, 3, 0.0, integral=True)
-    plain, extra = chain(delayed), chain(delayed, always_extra=True)
+    plain, extra = chain(delayed), chain(delayed, 4)
     kept = np.r_[:18, 24 : 24 + 18]
     assert np.array_equal(extra.A[np.ix_(kept, kept)], plain.A)
     assert not extra.A[:, 18:24].any()

@@ -17,8 +17,8 @@ from stewart_drake.law.sensing import EncoderSensing, Measurement, encoders_of, 
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.mechanism.kinematics import legs_along
 from stewart_drake.scenario.calibration import OFFSETS
-from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import PARAMETERS, POSE, RATES
+from stewart_drake.scenario.timing import Delay
 from stewart_drake.types import Array
 from tests.filters import Filter, Period
 from tests.mechanisms import PAPER

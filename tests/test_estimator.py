@@ -18,8 +18,8 @@ from stewart_drake.law.nominal import NominalPlant, TorqueLimit
 from stewart_drake.law.observers import CoreObserver
 from stewart_drake.law.sensing import Measurement, StateSensing
 from stewart_drake.law.timeline import Timeline
-from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import PARAMETER_UNITS, PARAMETERS, PAYLOAD
+from stewart_drake.scenario.timing import Delay
 from stewart_drake.types import Array
 from tests.filters import Filter, FilterEstimate, Period
 from tests.mechanisms import PAPER

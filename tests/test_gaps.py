@@ -11,7 +11,7 @@ from stewart_drake.law.observers import CoreObserver
 from stewart_drake.law.sensing import Measurement, StateSensing
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.loop.simulation import simulate
-from stewart_drake.scenario.delay import Delay
+from stewart_drake.scenario.timing import Delay
 from tests.mechanisms import PAPER
 
 DT = 0.1

@@ -131,7 +131,7 @@ def test_powers_of_the_matrix_are_wrong_where_the_margin_is_right():
 def test_only_the_papers_chain_has_modes_that_no_output_shows(steps):
     """T(k-mu-1) acts on nothing without a fraction: six zero modes, gone after one step."""
     model = delayed_model(PAPER_MODEL, 0.1, steps, 0.0, integral=True)
-    minimal, extra = chain(model), chain(model, always_extra=True)
+    minimal, extra = chain(model), chain(model, steps + 1)
     assert not hautus(minimal.A.T, minimal.C.T, discrete=True).deficient
     test = hautus(extra.A.T, extra.C.T, discrete=True)
     (mode,) = test.deficient
@@ -146,7 +146,7 @@ def test_only_the_papers_chain_has_modes_that_no_output_shows(steps):
     assert not hautus(extra.A, extra.B, discrete=True).deficient
     # With a fraction of a period it is the minimal chain.
     broken = delayed_model(PAPER_MODEL, 0.1, steps, 0.5, integral=True)
-    extra = chain(broken, always_extra=True)
+    extra = chain(broken, steps + 1)
     assert np.array_equal(extra.A, chain(broken).A)
     assert not hautus(extra.A.T, extra.C.T, discrete=True).deficient
 

@@ -14,7 +14,6 @@ from stewart_drake.core.library import core
 from stewart_drake.dynamics.workspace import margin
 from stewart_drake.mechanism.assembly import joint_state
 from stewart_drake.mechanism.files import load_mechanism
-from stewart_drake.mechanism.geometry import geometry_of
 from stewart_drake.mechanism.kinematics import (
     ForwardKinematicsError,
     SingularPoseError,
@@ -367,7 +366,7 @@ def joined_to_home(mechanism, number):
 def test_the_core_has_the_same_kinematics(name):
     """Angles and Jacobian; and every pose up to a singularity, from the guess of home."""
     mechanism, c = load_mechanism(name), core()
-    legs, angles, J = np.array(geometry_of(mechanism)), np.empty(6), np.empty((6, 6))
+    legs, angles, J = np.array(mechanism.numbers), np.empty(6), np.empty((6, 6))
     for pose in joined_to_home(mechanism, 100):
         c.lib.stewart_crank_angles(c.at(legs), c.at(pose), c.at(angles))
         assert c.lib.stewart_crank_jacobian(c.at(legs), c.at(pose), c.at(J))
@@ -380,7 +379,7 @@ def test_the_core_has_the_same_kinematics(name):
 
 
 def test_the_core_refuses_what_no_pose_has():
-    c, legs, J = core(), np.array(geometry_of(PAPER)), np.empty((6, 6))
+    c, legs, J = core(), np.array(PAPER.numbers), np.empty((6, 6))
     angles, away = np.array([0.0, 3, 0, 3, 0, 3]), PAPER.home + [0, 0, 0, 0, 0, 1.0]
     found = PAPER.home.copy()
     given = (c.at(legs), c.at(angles), c.at(found), c.scratch(48))

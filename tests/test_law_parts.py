@@ -28,8 +28,8 @@ from stewart_drake.law.observers import CoreObserver
 from stewart_drake.law.sensing import FirstState, Measurement, StateSensing
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
-from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import ACCELERATIONS, NUM_STATE
+from stewart_drake.scenario.timing import Delay
 from stewart_drake.types import Array
 from tests.mechanisms import PAPER
 from tests.oracles import relative

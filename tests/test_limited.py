@@ -13,8 +13,17 @@ from stewart_drake.law.belief import Belief, Estimate
 from stewart_drake.law.clear_space import ClearSpace
 from stewart_drake.law.coverage import uncovered_part
 from stewart_drake.law.feedforward import GAUSS_NODES, InverseDynamicsFeedforward, mean_torques
-from stewart_drake.law.horizon import HoldModel, HorizonCost, condense, pose_root, riccati
-from stewart_drake.law.horizon_qp import NEAR, QpError, problem_of, solve_by_daqp
+from stewart_drake.law.horizon import (
+    NEAR,
+    HoldModel,
+    HorizonCost,
+    QpError,
+    condense,
+    pose_root,
+    problem_of,
+    riccati,
+    solve_by_daqp,
+)
 from stewart_drake.law.least_error import LEAST_ERROR_SHARE
 from stewart_drake.law.limited import LimitedLqi
 from stewart_drake.law.nominal import NominalPlant, TorqueLimit
@@ -23,14 +32,14 @@ from stewart_drake.loop.bulk import run_in_bulk
 from stewart_drake.loop.law_design import catch_up_of, clear_space, compose_law
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.simulation import simulate
-from stewart_drake.mechanism.clearance import LINK_PAIRS, clearances
+from stewart_drake.mechanism.clearance import LINK_PAIRS
 from stewart_drake.mechanism.files import load_mechanism
-from stewart_drake.mechanism.kinematics import legs_along, reach_margins
+from stewart_drake.mechanism.kinematics import reach_margins
 from stewart_drake.mechanism.trajectories import evaluate, rows_along
 from stewart_drake.reporting.run import run_document
-from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.loading import load_scenario
-from tests.oracles import central_difference
+from stewart_drake.scenario.timing import Delay
+from tests.oracles import capsule_clearances, central_difference
 
 ON = ("plant.kind=exact", "start=on_reference", "queue=reference")
 NONE = "controller.estimate=[]"
@@ -237,8 +246,8 @@ def test_room_is_that_of_the_margins_and_clearances(name):
     space = clear_space(prepare(load_scenario(name)))
     machine, far = space.mechanism, np.random.default_rng(3).uniform(-1, 1, (300, 6))
     poses = machine.home + 0.6 * far * np.repeat([1.0, machine.crank_lengths.min()], 3)
-    margins, legs = reach_margins(machine, poses), legs_along(machine, poses)
-    apart = clearances(machine, poses, legs)[:, space.pairs]
+    margins = reach_margins(machine, poses)
+    apart = capsule_clearances(machine, poses)[:, space.pairs]
     expected = np.hstack([margins, apart]) / machine.crank_lengths.min() - space.least
     assert np.isnan(expected).any() and (expected < 0).any()
     np.testing.assert_allclose(space.room(poses), expected, atol=1e-12)

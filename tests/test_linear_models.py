@@ -6,11 +6,11 @@ import pytest
 
 import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.law.delay_model import ContinuousModel
+from stewart_drake.law.delay_model import LinearModel
 from stewart_drake.law.stability import LinearLoop, loop_gain, sensitivity, spectral_radius
 from stewart_drake.loop.controller_margin import controller_margin, loop_at, state_spaces
 from stewart_drake.loop.preparation import prepare
-from stewart_drake.scenario.delay import Delay
+from stewart_drake.scenario.timing import Delay
 
 OMEGA = np.geomspace(0.05, 30, 40)
 
@@ -22,7 +22,7 @@ def at(system, omega, period):
 def test_double_integrator_in_closed_form():
     """L = (k1 h^2/2 (z + 1) + k2 h (z - 1)) / (z - 1)^2 z^-mu / (1 + k3 z^-1) by hand."""
     h, k1, k2, k3 = 0.1, 2.0, 3.0, 0.4
-    plant = ContinuousModel(np.array([[0.0, 1], [0, 0]]), np.array([[0.0], [1]]), np.eye(1, 2))
+    plant = LinearModel(np.array([[0.0, 1], [0, 0]]), np.array([[0.0], [1]]), np.eye(1, 2))
     loop = LinearLoop(plant, np.array([[k1, k2, k3]]), h, Delay(1), integral=False)
     models = state_spaces(loop)
     for omega in OMEGA:

@@ -21,7 +21,6 @@ from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.simulation import make_simulator
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.scenario.config import DelayConfig
-from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.link import (
     delay_at,
     forward_times,
@@ -31,6 +30,7 @@ from stewart_drake.scenario.link import (
 )
 from stewart_drake.scenario.link_config import NetworkConfig
 from stewart_drake.scenario.loading import scenario_yaml
+from stewart_drake.scenario.timing import Delay
 from stewart_drake.studies.uncertainty import MACHINE, apply_draw
 
 PERIOD = 0.1

@@ -19,9 +19,9 @@ from stewart_drake.loop.diagram import build_closed_loop
 from stewart_drake.loop.simulation import make_simulator, simulate
 from stewart_drake.mechanism.kinematics import leg_geometry, rotation
 from stewart_drake.mechanism.trajectories import evaluate, make_reference
-from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.signals import LEGS
+from stewart_drake.scenario.timing import Delay
 from stewart_drake.studies import delay
 from stewart_drake.studies.delay import study_delay
 from stewart_drake.studies.study_options import DelayOptions

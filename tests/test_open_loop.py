@@ -1,6 +1,6 @@
 """The exact plant without Drake: DOP853 against scipy, energy, order, events, where it ends."""
 
-import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,12 +8,7 @@ from pydrake.systems.primitives import ConstantVectorSource
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from stewart_drake.dynamics.open_loop import (
-    Ended,
-    IntegrationError,
-    NativePlant,
-    integrate,
-)
+from stewart_drake.dynamics.open_loop import Ended, IntegrationError, NativePlant
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import margin
 from stewart_drake.loop.exact import ExactPlant, set_accuracy
@@ -42,11 +37,26 @@ def of_scipy(dynamics, begins, torques, times, rtol):
     return states
 
 
+def integrate(dynamics, start, torque, times, accuracy=1e-9, pieces=1):
+    """Run under one torque, in pieces of equal length."""
+    times = np.array(times, np.float64)
+    plant = NativePlant(dynamics, np.array(start), times, accuracy)
+    ended = plant.hold(times[-1] / pieces * np.arange(pieces), np.tile(torque, (pieces, 1)))
+    return SimpleNamespace(
+        times=times[: plant.run.recorded],
+        states=plant.states[: plant.run.recorded],
+        end=plant.run.time,
+        final=plant.final,
+        failure=plant.failure(ended),
+        steps=plant.run.steps,
+    )
+
+
 def test_states_are_those_of_scipy_at_any_time():
     """Gravity, payload, damping, bias; torques that change between the looks."""
     times = np.sort(np.random.default_rng(1).uniform(0, 0.4, 57))
     begins, torques = [0.0, 0.1234, 0.3], [PUSH, 2 * HOLD - PUSH, HOLD]
-    found = NativePlant(HEAVY, AT_HOME, times, 1e-12, math.inf)
+    found = NativePlant(HEAVY, AT_HOME, times, 1e-12)
     assert found.hold(begins, torques) == Ended.INSIDE
     expected = of_scipy(HEAVY, begins, torques, times, 1e-13)
     assert found.run.time == times[-1] and found.run.recorded == len(times)
@@ -87,7 +97,7 @@ def test_order(looks, order):
     errors, numbers, times = [], np.array([12, 16, 24]), np.linspace(0.4, 0.1, looks)[::-1]
     expected = of_scipy(HEAVY, [0.0], [PUSH], times, 1e-13)
     for number in numbers:
-        found = integrate(HEAVY, AT_HOME, PUSH, times, 1e-2, 0.4 / number)
+        found = integrate(HEAVY, AT_HOME, PUSH, times, 1e-2, number)
         assert found.steps in (number, number + 1)  # the first one may be shorter
         errors.append(np.abs(found.states - expected).max())
     slope = -np.polyfit(np.log(numbers), np.log(errors), 1)[0]
@@ -168,6 +178,6 @@ def test_torques_beyond_all_bounds_end_in_an_error():
 
 def test_where_there_is_no_number_steps_are_cut_to_a_fifth():
     """Like scipy: at most ln(0.1 / 16 eps) / ln 5 steps of eleven evaluations."""
-    plant = NativePlant(HEAVY, AT_HOME, np.array([0.1]), 1e-9, math.inf)
+    plant = NativePlant(HEAVY, AT_HOME, np.array([0.1]), 1e-9)
     assert plant.hold([0.0], np.full(6, np.nan)) == Ended.TOO_SHORT_STEPS
     assert plant.run.evaluations < 30 * 11

@@ -25,7 +25,6 @@ from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.simulation import make_simulator
 from stewart_drake.reporting.link import document
 from stewart_drake.reporting.page import Provenance, html
-from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.link_config import NetworkConfig, PacketsConfig
 from stewart_drake.scenario.packets import (
     default_bound,
@@ -34,7 +33,7 @@ from stewart_drake.scenario.packets import (
     packet_times,
     torque_missing,
 )
-from stewart_drake.scenario.timing import look_time
+from stewart_drake.scenario.timing import Delay, look_time
 from stewart_drake.studies import link as link_study
 from stewart_drake.studies.link import Cell, study_link
 from stewart_drake.studies.runs import Outcome

@@ -7,7 +7,7 @@ import pytest
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
 import stewart_drake as sd
-from stewart_drake.dynamics.open_loop import integrate
+from stewart_drake.dynamics.open_loop import NativePlant
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.live.simulated import DrakeBody, NativeBody
 from stewart_drake.loop.bulk import run_in_bulk
@@ -36,7 +36,9 @@ def pushed_by_hand(start):
     for until, wrench in ((0.123, np.zeros(6)), (0.31, WRENCH), (UNTIL, np.zeros(6))):
         constants = sd.StewartDynamics(PAPER).plant_parameters[:NUM_CONSTANTS]
         dynamics = sd.StewartDynamics(PAPER, False, np.concatenate([constants, wrench]))
-        start = integrate(dynamics, start, TORQUE, [until - time], 1e-12).final
+        plant = NativePlant(dynamics, start, np.array([until - time]), 1e-12)
+        plant.hold([0.0], [TORQUE])
+        start = plant.final
         time = until
     return start
 

@@ -29,7 +29,6 @@ from stewart_drake.identification.servo_plan import mixed_motion, plan_servos
 from stewart_drake.law.servos import PositionServo, crank_mobility
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.servos import servo_law
-from stewart_drake.mechanism.geometry import geometry_of
 from stewart_drake.mechanism.trajectories import evaluate
 from stewart_drake.reporting.servo_identification import document
 from tests.screen import too_long
@@ -226,7 +225,7 @@ def with_soft_friction(model, late, lead):
     smooth = TRUE.copy()
     smooth[3] = 0.0
     dynamics, servo = model._dynamics(smooth), PositionServo(TRUE[1], 0.0, 0.8)
-    geometry, slope = geometry_of(ROBOT), TRUE[3] / TRUE[4]
+    geometry, slope = ROBOT.numbers, TRUE[3] / TRUE[4]
     pose, rates, friction, cranks = log.poses[0].copy(), np.zeros(6), np.zeros(6), []
     for k in range(round(log.times[-1] / h) + 1):
         if k % 20 == 0:

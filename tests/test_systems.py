@@ -35,9 +35,8 @@ from stewart_drake.loop.sensor import Encoders, Sensor
 from stewart_drake.loop.simulation import make_simulator
 from stewart_drake.loop.tuner import AnnTuner, DensityWindow
 from stewart_drake.mechanism.trajectories import evaluate, make_reference
-from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.loading import load_scenario
-from stewart_drake.scenario.timing import look_time
+from stewart_drake.scenario.timing import Delay, look_time
 from stewart_drake.tuner.network import load_network
 from tests.backends import with_own
 from tests.mechanisms import PAPER

@@ -27,7 +27,10 @@ static real lines_of(const Leg *leg, const Turn *turn, const real *pose, Line *c
     return left;
 }
 
-/* Distance of two lines; the method is that of `segment_distances` in mechanism/clearance.py. */
+/* Distance of two lines, at the shares s and t of them. Its square is convex in s and t. The best s of the whole
+   lines is cut to the segment, then the best t for it, then the best s for that: where one was cut, the minimum
+   lies on the border of the square, and these steps end there. Parallel lines have many minima, and s = 0
+   leads to one. */
 static real distance(const Line *a, const Line *b)
 {
     real r[3], d[3];

@@ -100,7 +100,7 @@ int dop853_step(dop853 *s, double end)
     s->has_polynomial = 0;
     for (;;) {
         /* Steps of one length up to the end, so that the last is not a short one. */
-        double left = end - s->before, most = fmin(s->next_step, s->longest);
+        double left = end - s->before, most = s->next_step;
         double parts = ceil(left / most * (1. - 1e-9)), h = parts > 1. ? left / parts : left;
         if (!(most > 16. * DBL_EPSILON * fmax(1., fabs(s->before))))
             return 0;

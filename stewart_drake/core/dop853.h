@@ -12,7 +12,6 @@ typedef struct {
     slope_function slope;
     void *system;
     double tolerance;  /* of the error of a step: relative and absolute */
-    double longest;    /* longest step, s */
     double time, x[STATES];
     double next_step;  /* largest step that the error allows, s; 0 for none known yet */
     double before, start[STATES]; /* time and state at which the last step began */

@@ -18,41 +18,35 @@ static int in_flight_length(const stewart_law *law)
     return law->layout.in_flight.rows;
 }
 
-/* Reserve a field at the end of the memory. */
-static stewart_field place(stewart_law *law, int rows, int columns)
-{
-    stewart_field field = {law->memory, rows, columns};
-    law->memory += rows * columns;
-    return field;
-}
-
 void stewart_prepare(stewart_law *law)
 {
     stewart_layout *l = &law->layout;
     const int observed = law->observer->memory(law), estimated = law->machine.estimated;
     law->memory = 0;
-    l->in_flight = place(law, 1 + law->extra_torques + stewart_queue_length(law), U);
-    l->observer = place(law, 1, observed);
-    l->lag = place(law, 1, 1);
-    l->state = place(law, 1, X);
-    l->parameters = place(law, 1, estimated);
-    l->measurement = place(law, 1, law->num_values);
-    l->error = place(law, 1, 6);
-    l->integral = place(law, 1, 6);
-    l->gain = place(law, U, law->design ? law->design->columns : stewart_order(&law->cost, law->fraction > 0));
-    l->torque = place(law, 1, U);
-    l->feedforward = place(law, 1, U);
-    l->weights = place(law, 1, 2);
-    l->open_loop_samples = place(law, 1, 1);
-    l->times = place(law, 1, law->rows);
-    l->reference = place(law, law->rows, ROW);
-    l->followed = place(law, law->rows, ROW);
-    l->gap = place(law, 1, 1);
-    l->blend = place(law, 1, X + 2);
-    l->channel = place(law, 1, law->channel ? law->channel->memory(law) : 0);
-    l->planner = place(law, 1, law->planner ? law->planner->memory(law) : 0);
-    l->counts = place(law, 1, STEWART_CAUSES);
-    l->started = place(law, 1, 1);
+    l->in_flight = stewart_place(law, 1 + law->extra_torques + stewart_queue_length(law), U);
+    l->observer = stewart_place(law, 1, observed);
+    l->lag = stewart_place(law, 1, 1);
+    l->state = stewart_place(law, 1, X);
+    l->parameters = stewart_place(law, 1, estimated);
+    l->measurement = stewart_place(law, 1, law->num_values);
+    l->error = stewart_place(law, 1, 6);
+    l->integral = stewart_place(law, 1, 6);
+    l->gain = stewart_place(law, U,
+                            law->design ? law->design->columns
+                                        : stewart_order(&law->cost, law->fraction > 0));
+    l->torque = stewart_place(law, 1, U);
+    l->feedforward = stewart_place(law, 1, U);
+    l->weights = stewart_place(law, 1, 2);
+    l->open_loop_samples = stewart_place(law, 1, 1);
+    l->times = stewart_place(law, 1, law->rows);
+    l->reference = stewart_place(law, law->rows, ROW);
+    l->followed = stewart_place(law, law->rows, ROW);
+    l->gap = stewart_place(law, 1, 1);
+    l->blend = stewart_place(law, 1, X + 2);
+    l->channel = stewart_place(law, 1, law->channel ? law->channel->memory(law) : 0);
+    l->planner = stewart_place(law, 1, law->planner ? law->planner->memory(law) : 0);
+    l->counts = stewart_place(law, 1, STEWART_CAUSES);
+    l->started = stewart_place(law, 1, 1);
 }
 
 static void copy_finite_torque(const real *torque, real *to)

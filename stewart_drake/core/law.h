@@ -29,6 +29,7 @@ typedef struct {
 } stewart_field;
 
 typedef struct {
+    stewart_field command;     /* of servos, sent last */
     stewart_field in_flight;   /* limited torques, the oldest first */
     stewart_field observer;    /* memory of the observer after its last measurement */
     stewart_field lag;         /* age of that measurement, periods */
@@ -198,6 +199,9 @@ int stewart_planning_scratch(const stewart_law *law);
 
 /* Limit a torque (6). Returns whether that changed it. */
 int stewart_limit(const stewart_machine *machine, const real *torque, real *limited);
+
+/* Reserve a field at the end of the memory. */
+stewart_field stewart_place(stewart_law *law, int rows, int columns);
 
 /* Add to a count, which stops near a million: beyond 2^24 a float does not count on. */
 void stewart_count(int number, real *count);

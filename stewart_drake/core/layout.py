@@ -1,14 +1,8 @@
-"""Arguments and results of the functions in C, and the numbers of a machine."""
+"""The numbers of a machine, as the core takes them."""
 
-from typing import Any, Final
+from typing import Final
 
-from stewart_drake.scenario.signals import (
-    NUM_COORDINATES,
-    NUM_LEGS,
-    NUM_PLANT_PARAMETERS,
-    NUM_STATE,
-    NUM_TORQUES,
-)
+from stewart_drake.scenario.signals import NUM_LEGS
 
 DEFAULT_GRAVITY: Final = 9.81
 """Gravity along -z of W, m/s^2; Drake's default."""
@@ -28,34 +22,3 @@ mean radius."""
 MEASURES: Final = NUM_LEGS + 2
 """Six sines off dead centre, the measure of parallel singularity, minus |pitch|."""
 GEOMETRY: Final = NUM_LEGS * LEG_NUMBERS + COMMON_NUMBERS
-
-SHAPES: Final = {
-    "pose": (NUM_COORDINATES,),
-    "rates": (NUM_COORDINATES,),
-    "state": (NUM_STATE,),
-    "accelerations": (NUM_COORDINATES,),
-    "torque": (NUM_TORQUES,),
-    "parameters": (NUM_PLANT_PARAMETERS,),
-    "gravity": (),
-    "angles": (NUM_LEGS,),
-}
-"""Shape of each argument."""
-
-
-def _signature(arguments: str, *results: tuple[int, ...]) -> tuple[list[str], tuple[Any, ...]]:
-    return arguments.split(), results
-
-
-SIGNATURES: Final = {
-    "accelerations": _signature("pose rates torque parameters gravity", (6,)),
-    "inverse_dynamics": _signature("pose rates accelerations parameters gravity", (6,)),
-    "energy": _signature("pose rates parameters gravity", ()),
-    "residual_derivatives": _signature(
-        "pose rates accelerations torque parameters gravity",
-        *((NUM_STATE, 6), (NUM_PLANT_PARAMETERS, 6), (6, 6), (6, 6)),
-    ),
-    "measures": _signature("pose", (MEASURES,)),
-    "measures_of_tree": _signature("pose angles", (MEASURES,)),
-    "change": _signature("state torque parameters gravity", (NUM_STATE,)),
-}
-"""Functions of dynamics.h: names of their arguments, and shapes of their results, transposed."""

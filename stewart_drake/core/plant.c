@@ -126,7 +126,7 @@ static int advance(dop853 *s, stewart_run *r, double end)
 static dop853 integrator(DrivenPlant *d)
 {
     const stewart_run *r = d->run;
-    dop853 s = {.slope = slope, .system = d, .tolerance = r->tolerance, .longest = r->longest_step};
+    dop853 s = {.slope = slope, .system = d, .tolerance = r->tolerance};
     s.time = r->time;
     stewart_copy(X, r->state, s.x);
     return s;

@@ -21,7 +21,7 @@ enum { STEWART_INSIDE, STEWART_OUTSIDE, STEWART_TOO_SHORT_STEPS, STEWART_CONTROL
 typedef struct {
     const stewart_plant *plant;
     double sign, least[STEWART_NUM_MEASURES]; /* workspace, see `stewart_margin` */
-    double tolerance, longest_step, end;  /* error of a step; longest step, s; end of the run, s */
+    double tolerance, end;                /* error of a step; end of the run, s */
     long number;                          /* of times at which the state is recorded */
     const double *times;                  /* (number) ascending, s */
     double *states;                       /* (number, 12) result; the first `recorded` are valid */

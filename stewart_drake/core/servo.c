@@ -7,28 +7,21 @@ static int width(const stewart_servo *servo) { return U * servo->law.parts + 1; 
 
 int stewart_servo_report(const stewart_servo *servo) { return servo->periods * width(servo) + U; }
 
-static stewart_field place(stewart_servo *servo, int columns)
-{
-    stewart_field field = {servo->memory, 1, columns};
-    servo->memory += columns;
-    return field;
-}
-
 void stewart_servo_prepare(stewart_servo *servo)
 {
-    const stewart_law *law = &servo->law;
-    stewart_servo_layout *l = &servo->layout;
-    servo->memory = 0;
-    l->command = place(servo, STEWART_COMMAND);
-    l->observer = place(servo, law->observer->memory(law));
-    l->lag = place(servo, 1);
-    l->state = place(servo, X);
-    l->parameters = place(servo, law->machine.estimated);
-    l->measurement = place(servo, law->num_values);
-    l->torque = place(servo, U);
-    l->in_flight = place(servo, U);
-    l->counts = place(servo, STEWART_CAUSES);
-    l->started = place(servo, 1);
+    stewart_law *law = &servo->law;
+    stewart_layout *l = &law->layout;
+    law->memory = 0;
+    l->command = stewart_place(law, 1, STEWART_COMMAND);
+    l->observer = stewart_place(law, 1, law->observer->memory(law));
+    l->lag = stewart_place(law, 1, 1);
+    l->state = stewart_place(law, 1, X);
+    l->parameters = stewart_place(law, 1, law->machine.estimated);
+    l->measurement = stewart_place(law, 1, law->num_values);
+    l->torque = stewart_place(law, 1, U);
+    l->in_flight = stewart_place(law, 1, U);
+    l->counts = stewart_place(law, 1, STEWART_CAUSES);
+    l->started = stewart_place(law, 1, 1);
 }
 
 int stewart_servo_scratch(const stewart_servo *servo)
@@ -41,7 +34,7 @@ int stewart_servo_scratch(const stewart_servo *servo)
 static void take_estimate(const stewart_servo *servo, real *memory)
 {
     const stewart_law *law = &servo->law;
-    const stewart_servo_layout *l = &servo->layout;
+    const stewart_layout *l = &servo->law.layout;
     real std[STEWART_MAX_ESTIMATED];
     stewart_copy(X, memory + l->observer.at, memory + l->state.at);
     law->observer->parameters(law, memory + l->observer.at, memory + l->parameters.at, std);
@@ -49,8 +42,8 @@ static void take_estimate(const stewart_servo *servo, real *memory)
 
 void stewart_servo_start(const stewart_servo *servo, real *memory, const real *command)
 {
-    const stewart_servo_layout *l = &servo->layout;
-    stewart_fill(servo->memory, 0, memory);
+    const stewart_layout *l = &servo->law.layout;
+    stewart_fill(servo->law.memory, 0, memory);
     stewart_copy(STEWART_COMMAND, command, memory + l->command.at);
     memory[l->started.at] = STEWART_STARTED;
     servo->law.observer->start(&servo->law, memory + l->observer.at);
@@ -80,7 +73,7 @@ static int observe(const stewart_servo *servo, real *memory, const stewart_sampl
                    const real *report, int periods, stewart_scratch scratch)
 {
     const stewart_law *law = &servo->law;
-    const stewart_servo_layout *l = &servo->layout;
+    const stewart_layout *l = &servo->law.layout;
     real *torques = stewart_take(&scratch, U * law->parts * servo->periods + U);
     real *observer = memory + l->observer.at;
     int saturated = 0, number = read_report(servo, report, periods, torques, &saturated);
@@ -159,7 +152,7 @@ int stewart_servo_step(const stewart_servo *servo, real *memory, real *scratch_m
                        const stewart_sample *sample, const real *report, real *command)
 {
     const stewart_law *law = &servo->law;
-    const stewart_servo_layout *l = &servo->layout;
+    const stewart_layout *l = &servo->law.layout;
     const stewart_scratch scratch = {scratch_memory};
     if (memory[l->started.at] != STEWART_STARTED) {
         stewart_fill(STEWART_COMMAND, 0, command);

@@ -21,19 +21,6 @@
 
 #define STEWART_COMMAND 18 /* crank angles (rad), their rates (rad/s), torques (N m) */
 
-typedef struct {
-    stewart_field command;     /* sent last */
-    stewart_field observer;    /* at the last measurement */
-    stewart_field lag;         /* age of that measurement, periods */
-    stewart_field state;       /* at the last measurement */
-    stewart_field parameters;
-    stewart_field measurement; /* the last one, unchanged */
-    stewart_field torque;      /* torque of the servos at their last report, before the limit */
-    stewart_field in_flight;   /* the same within the limit */
-    stewart_field counts;      /* samples with each bit of `stewart_status` */
-    stewart_field started;     /* STEWART_STARTED */
-} stewart_servo_layout;
-
 /* Servos given by their stiffness; k = 0: the other kind. */
 typedef struct {
     real stiffness;     /* k, N m/rad */
@@ -42,8 +29,9 @@ typedef struct {
     real most;          /* largest change of a setpoint per period, rad */
 } stewart_stiffness;
 
-/* Of `law`, the gain, channel, planner and layout are not used; its `parts` are torques per period of a
-   report. */
+/* Of `law`, the gain, channel and planner are not used; its `parts` are torques per period of a report. Its
+   layout: the last command; observer, state and parameters at the last measurement; its age; and the torque
+   of the servos at their last report, before and within the limit. */
 typedef struct stewart_servo {
     stewart_law law;
     stewart_stiffness stiff;
@@ -51,14 +39,13 @@ typedef struct stewart_servo {
        NULL: no change. */
     int (*command)(const struct stewart_servo *servo, const real *theta, const real *row, real *command);
     int periods; /* rows of a report; `periods` - 1 reports in a row may be lost without loss of data */
-    int memory;  /* numbers of the memory; `stewart_servo_prepare` sets this and `layout` */
-    stewart_servo_layout layout;
 } stewart_servo;
 
 /* Return the size of a report: for each period, the oldest first, the mean torques over equal parts of it
    (parts, 6) and whether one was at the limit; then the last torque before the limit (6). */
 int stewart_servo_report(const stewart_servo *servo);
 
+/* Set the memory and layout of `law`. */
 void stewart_servo_prepare(stewart_servo *servo);
 
 int stewart_servo_scratch(const stewart_servo *servo);

@@ -1,4 +1,4 @@
-/* Torque schedules under a known delay, the limit of the motors, and counts. See law.h. */
+/* Torque schedules under a known delay, the limit of the motors, and what laws remember. See law.h. */
 
 #include "law.h"
 #include "short.h"
@@ -21,6 +21,13 @@ int stewart_limit(const stewart_machine *machine, const real *torque, real *limi
         saturated |= limited[i] != torque[i];
     }
     return saturated;
+}
+
+stewart_field stewart_place(stewart_law *law, int rows, int columns)
+{
+    stewart_field field = {law->memory, rows, columns};
+    law->memory += rows * columns;
+    return field;
 }
 
 void stewart_count(int number, real *count)

@@ -24,15 +24,15 @@ from stewart_drake.core.layout import (
     DEAD_CENTRE_SINE,
     GEOMETRY,
     LEG_NUMBERS,
-    SHAPES,
 )
-from stewart_drake.mechanism.geometry import Mechanism, geometry_of
+from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.signals import (
     BIAS,
     COULOMB,
     COULOMB_SPEED,
     DAMPING,
     NUM_LEGS,
+    NUM_PLANT_PARAMETERS,
     PAYLOAD,
     PAYLOAD_POSITION,
     WRENCH,
@@ -71,9 +71,7 @@ class CommonNumbers(NamedTuple):
 
 def numbers_of(mechanism: Mechanism) -> tuple[list[LegNumbers], CommonNumbers]:
     """Return the numbers of a machine."""
-    legs, common = ca.vertsplit(
-        ca.DM(geometry_of(mechanism)), [0, NUM_LEGS * LEG_NUMBERS, GEOMETRY]
-    )
+    legs, common = ca.vertsplit(ca.DM(mechanism.numbers), [0, NUM_LEGS * LEG_NUMBERS, GEOMETRY])
     by_leg = ca.horzsplit(ca.reshape(legs, NUM_LEGS, LEG_NUMBERS).T)
     return [leg_numbers(one) for one in by_leg], common_numbers(common)
 
@@ -431,7 +429,9 @@ def solve_symmetric(matrix: ca.SX, right: ca.SX) -> ca.SX:
 
 def symbols() -> dict[str, ca.SX]:
     """Return new symbols for all arguments of the equations."""
-    return {name: ca.SX.sym(name, *shape) for name, shape in SHAPES.items()}
+    six = ("pose", "rates", "accelerations", "torque", "angles")
+    sizes = dict.fromkeys(six, 6) | {"parameters": NUM_PLANT_PARAMETERS, "gravity": 1}
+    return {name: ca.SX.sym(name, size) for name, size in sizes.items()}
 
 
 def leg_measures(

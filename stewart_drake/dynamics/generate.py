@@ -1,7 +1,7 @@
 """`python -m stewart_drake.dynamics.generate` writes core/equations.h and models/*.sdf.
 
 The expressions are those of `dynamics.equations`. They hold for any machine: its geometry
-(`mechanism.geometry.geometry_of`) is an argument. An expression of one leg becomes a loop over six,
+(`Mechanism.numbers`) is an argument. An expression of one leg becomes a loop over six,
 which a compiler can vectorise. core/dynamics.c calls these functions.
 """
 

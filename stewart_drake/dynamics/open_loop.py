@@ -1,19 +1,19 @@
 """The exact plant alone under known torques, without Drake (core/plant.h).
 
 DOP853, the Runge-Kutta method of order 8 of Dormand and Prince, integrates from one change of the
-torques to the next and stops where the plate leaves its workspace (docs/theory.md, section 32).
+torques to the next and stops where the plate leaves its workspace (docs/theory.md, section 32). The
+workspace is checked at the ends of steps and at the recorded times; the instant of leaving is found
+to 1e-13 s.
 """
 
-import math
 from enum import IntEnum
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import LEAST, Failure, diagnose, home_sign
-from stewart_drake.mechanism.geometry import geometry_of
 from stewart_drake.scenario.signals import NUM_STATE, POSE, WRENCH
 from stewart_drake.types import Array, ArrayLike
 
@@ -38,8 +38,7 @@ class NativePlant:
         dynamics: equations of motion, with the true parameters.
         start: (12,) state.
         times: (n,) s, ascending, at which states are wanted; the last one is the end.
-        accuracy: error of a step in a coordinate x, in units of 1 + |x|.
-        longest_step: s.
+        accuracy: error of a step in a coordinate x, in units of 1 + |x| (rad, m, and per s).
 
     Attributes:
         states: (n, 12) result; the first `run.recorded` are valid.
@@ -52,18 +51,17 @@ class NativePlant:
         start: Array,
         times: Array,
         accuracy: float,
-        longest_step: float,
     ) -> None:
         c, mechanism = core(), dynamics.mechanism
         self._mechanism = mechanism
         self.states = np.empty((len(times), NUM_STATE))
-        numbers = geometry_of(mechanism), dynamics.plant_parameters, dynamics.gravity
+        numbers = mechanism.numbers, dynamics.plant_parameters, dynamics.gravity
         copies = [np.array(one, np.float64) for one in numbers]
         self.wrench = copies[1][WRENCH]
         plant = c.plant(*map(c.at, copies))
         self.run: Any = c.ffi.new("stewart_run *")
         self.run.plant, self.run.sign, self.run.least = plant, home_sign(mechanism), list(LEAST)
-        self.run.tolerance, self.run.longest_step, self.run.end = accuracy, longest_step, times[-1]
+        self.run.tolerance, self.run.end = accuracy, times[-1]
         self.run.number, self.run.times = len(times), c.at(times)
         self.run.states, self.run.state = c.at(self.states), list(start)
         self._kept = copies, plant, times
@@ -73,7 +71,10 @@ class NativePlant:
         return Ended(getattr(core().lib, f"stewart_{name}")(self.run, *arguments))
 
     def hold(self, begins: ArrayLike, commands: ArrayLike, servo: Any = None) -> Ended:
-        """Run under commands (n, 6), each from its time in `begins` (n,) on, s, as `integrate`."""
+        """Run under commands (n, 6), each from its time in `begins` (n,) on, s.
+
+        They are motor torques, N m, or setpoints in rad of `servo`, a `stewart_position_servo *`.
+        """
         c, first, held = core(), np.array(begins, np.float64), np.array(commands, np.float64)
         servo = c.ffi.NULL if servo is None else servo
         return self.call("open_loop", servo, len(first), c.at(first), c.at(held))
@@ -96,53 +97,3 @@ class NativePlant:
     def final(self) -> Array:
         """(12,) state at the end."""
         return np.array(list(self.run.state))
-
-
-class Course(NamedTuple):
-    """Result of `integrate`."""
-
-    times: Array  # the requested times (n,) up to the end, s
-    states: Array  # (n, 12) at those times
-    end: float  # last requested time, or the instant at which the plate left its workspace, s
-    final: Array  # state (12,) at the end
-    failure: Failure | None  # why the plate left its workspace
-    steps: int
-
-
-def integrate(
-    dynamics: StewartDynamics,
-    start: ArrayLike,
-    command: ArrayLike,
-    times: ArrayLike,
-    accuracy: float = 1e-9,
-    longest_step: float = math.inf,
-    servo: Any = None,
-) -> Course:
-    """Integrate the exact plant from t = 0 to the last of `times`, or out of its workspace.
-
-    The workspace is checked at the ends of steps and at `times`. The instant of leaving is found to
-    1e-13 s.
-
-    Args:
-        dynamics: equations of motion, with the true parameters.
-        start: (12,) state at t = 0, in the workspace.
-        command: (6,) motor torques, N m, or setpoints of `servo`, rad.
-        times: (n,) s, ascending, at which states are wanted.
-        accuracy: error of a step in a coordinate x, in units of 1 + |x| (rad, m, and per s).
-        longest_step: s.
-        servo: a `stewart_position_servo *`, or None.
-
-    Raises:
-        IntegrationError: no step is short enough for the accuracy.
-    """
-    looks = np.array(times, dtype=np.float64)
-    plant = NativePlant(dynamics, np.array(start), looks, accuracy, longest_step)
-    failure, run = plant.failure(plant.hold([0.0], command, servo)), plant.run
-    return Course(
-        times=looks[: run.recorded],
-        states=plant.states[: run.recorded],
-        end=run.time,
-        final=plant.final,
-        failure=failure,
-        steps=run.steps,
-    )

@@ -13,9 +13,8 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.mechanism.assembly import TorqueMap, torque_map
 from stewart_drake.mechanism.files import as_mechanism
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.mechanism.kinematics import UnreachablePoseError, angle_rate_map
+from stewart_drake.mechanism.kinematics import UnreachablePoseError
 from stewart_drake.scenario.signals import (
-    ANGLES,
     BALL_JOINT_FRICTION_SPEED,
     COULOMB,
     COULOMB_SPEED,
@@ -204,9 +203,10 @@ class StewartDynamics:
             pose, rates, torque, self.complete(parameters), self.gravity
         )[0]
 
-    def change(self, state: Array, torque: Array) -> Array:
-        """Return d[pose; rates]/dt (12,) without checks of shapes, for an integrator."""
-        return self._functions.change(state, torque, self.plant_parameters, self.gravity)
+    def change(self, state: Array, torque: Array, parameters: Array | None = None) -> Array:
+        """Return d[pose; rates]/dt (12,), without checks, under all parameters (22,)."""
+        whole = self.plant_parameters if parameters is None else parameters
+        return self._functions.change(state, torque, whole, self.gravity)
 
     def inverse_dynamics(
         self,
@@ -252,37 +252,36 @@ class StewartDynamics:
         return self._functions.inertia(pose, self.complete(parameters))[0]
 
     def bias(self, pose: ArrayLike, rates: ArrayLike, parameters: ArrayLike | None = None) -> Array:
-        """Return h (6,): M accelerations + h = actuation_map (torque + torque bias - friction)."""
+        """Return h (6,), friction of ball joints included.
+
+        M accelerations + h = actuation_map (torque + torque bias - friction of the shafts) + wrench
+        """
         _check(pose=pose, rates=rates)
-        free, rest = np.array(self.complete(parameters)), np.zeros(NUM_TORQUES)
-        free[[*range(NUM_TORQUES), DAMPING, COULOMB]] = 0  # biases and friction
-        free[WRENCH] = 0
-        M = self._functions.inertia(pose, free)[0]
-        return -M @ self._functions.accelerations(pose, rates, rest, free, self.gravity)[0]
+        whole, rest = np.array(self.complete(parameters)), np.zeros(NUM_TORQUES)
+        whole[[*range(NUM_TORQUES), DAMPING, COULOMB]] = 0  # biases, and friction of the shafts
+        whole[WRENCH] = 0
+        M = self._functions.inertia(pose, whole)[0]
+        return -M @ self._functions.accelerations(pose, rates, rest, whole, self.gravity)[0]
 
     def wrench_accelerations(
         self, pose: ArrayLike, wrench: ArrayLike, parameters: ArrayLike | None = None
     ) -> Array:
-        """Return the accelerations of the pose (6,) due to a wrench on the plate.
-
-        A wrench F = [moment; force] at the plate's COM, in W, has the power
-        moment . w + force . v = F . nu: it is a generalised force of nu, and joins (EOM) as
-
-            M nu_dot + h = B torque + F.
-
-        With nu = N rates, N' M N in pose coordinates, and all else unchanged, that adds
-
-            (N' M N)^-1 N' F,   N = diag(E(angles), 1).
+        """Return the accelerations of the pose (6,) that a wrench on the plate adds.
 
         Args:
             pose: (6,).
-            wrench: (6,) N m and N.
+            wrench: (6,) moment and force in W at the plate's COM, N m and N.
             parameters: (p,) or the defaults.
         """
         _check(pose=pose, wrench=wrench)
-        force = np.array(wrench, dtype=np.float64)
-        force[ANGLES] = angle_rate_map(np.asarray(pose)[ANGLES]).T @ force[ANGLES]
-        return np.linalg.solve(self.mass_matrix(pose, parameters), force)
+        whole, rest = self.complete(parameters), np.zeros(NUM_COORDINATES)
+        pushed = whole.copy()
+        pushed[WRENCH] += wrench
+        with_it, without = (
+            self._functions.accelerations(pose, rest, rest, given, self.gravity)[0]
+            for given in (pushed, whole)
+        )
+        return with_it - without
 
     def actuation_map(self, pose: ArrayLike) -> Array:
         """Return the generalised force per torque (6, 6): the Jacobian's transpose."""
@@ -307,21 +306,17 @@ class StewartDynamics:
         rates: ArrayLike,
         torque: ArrayLike,
         parameters: ArrayLike | None = None,
-        wrench: ArrayLike | None = None,
     ) -> Linearization:
         """Return exact derivatives at any point, from those of F(state, accelerations).
 
         F = M nu_dot + h - B torque = 0 defines the accelerations implicitly, so that their
         derivatives are -(M N)^-1 dF, with dF taken at constant accelerations: no derivative of a
-        matrix inverse is needed. A constant `wrench` (6,) (`wrench_accelerations`) is a constant
-        part of F and changes the accelerations only.
+        matrix inverse is needed.
         """
         _check(pose=pose, rates=rates, torque=torque)
         whole = self.complete(parameters)
         at = (pose, rates, torque, whole, self.gravity)
         accelerations = self._functions.accelerations(*at)[0]
-        if wrench is not None:
-            accelerations += self.wrench_accelerations(pose, wrench, parameters)
         dF_dx, dF_dp, MN, arm = self._functions.residual_derivatives(
             pose, rates, accelerations, torque, whole, self.gravity
         )

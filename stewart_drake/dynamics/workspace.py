@@ -48,11 +48,7 @@ def measures_at(mechanism: Mechanism, pose: Array, crank_angles: Array | None = 
     A pose does not show whether a crank has passed its dead centre. With the crank angles (6,) of a
     simulated tree, the sine of such a crank is negative.
     """
-    functions = functions_of(mechanism)
-    if crank_angles is None:
-        measures = functions.measures(pose)[0]
-    else:
-        measures = functions.measures_of_tree(pose, crank_angles)[0]
+    measures = functions_of(mechanism).measures(pose, crank_angles)
     parallel, signed = float(measures[NUM_LEGS]), measures.copy()
     signed[NUM_LEGS] *= home_sign(mechanism)
     return Measures(measures[:NUM_LEGS], parallel, float(pose[1]), float((signed - LEAST).min()))
@@ -81,7 +77,7 @@ def margins(mechanism: Mechanism, poses: Array) -> Array:
 @lru_cache(maxsize=64)
 def home_sign(mechanism: Mechanism) -> float:
     """Return the sign of `Measures.parallel` at home; a motion that changes it passes 0."""
-    return float(np.sign(functions_of(mechanism).measures(mechanism.home)[0][NUM_LEGS]))
+    return float(np.sign(functions_of(mechanism).measures(mechanism.home)[NUM_LEGS]))
 
 
 def diagnose(

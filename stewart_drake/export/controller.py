@@ -33,7 +33,7 @@ from stewart_drake.law.compiled import Compiled, address_of
 from stewart_drake.law.core_law import CompiledLaw
 from stewart_drake.law.motion import KnownMotion
 from stewart_drake.law.predictive_lqi import PredictiveLqi
-from stewart_drake.law.servo_preview import ServoPreview
+from stewart_drake.law.servos import ServoPreview
 from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
 from stewart_drake.loop.law_design import control_law
 from stewart_drake.loop.peer import MOST_ROWS, MOST_SAMPLES, Fault, identity_of
@@ -193,9 +193,9 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
         "configuration": Constants(
             compiled.keep_alive, core().symbols, suffix, compiled.data[0], "stewart_law"
         ),
-        "memory": compiled.data.memory,
+        "memory": compiled.torques_law.memory,
         "scratch": compiled.scratch,
-        "sizes": compiled.data.law if servos else compiled.data,
+        "sizes": compiled.torques_law,
         "tuner": None,
         "least": LEAST,
         "home_sign": home_sign(experiment.mechanism),

@@ -15,7 +15,7 @@ from stewart_drake.law.gaps import LONGEST_GAP, longest_gap
 from stewart_drake.law.motion import Motion
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.sensing import Measurement
-from stewart_drake.law.servo_preview import ServoPreview
+from stewart_drake.law.servos import ServoPreview
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_controller

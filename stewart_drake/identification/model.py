@@ -27,7 +27,7 @@ from stewart_drake.core.layout import LEG_NUMBERS
 from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import plant_parameters
 from stewart_drake.identification.logs import Log
-from stewart_drake.mechanism.geometry import Mechanism, geometry_of
+from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import Legs, angle_rate_map, dot, legs_along, rotation
 from stewart_drake.scenario.signals import (
     ANGLES,
@@ -39,7 +39,7 @@ from stewart_drake.scenario.signals import (
 from stewart_drake.types import Array
 
 LEG_PLACES: Final = (0, 1, 12, 13, 14, 15, 16, 17)
-"""In a leg's numbers (`mechanism.geometry.geometry_of`): crank, rod, plate joint, shaft; m."""
+"""In a leg's numbers (`Mechanism.numbers`): crank, rod, plate joint, shaft; m."""
 PER_LEG: Final = len(LEG_PLACES)
 NUM_GEOMETRY: Final = NUM_LEGS * PER_LEG
 NUM_DYNAMIC: Final = NUM_CONSTANTS  # parameters of the dynamics; a log has no wrench
@@ -68,7 +68,7 @@ class MachineModel:
 
     def plant(self, numbers: Numbers) -> tuple[Any, object]:
         """Return a `stewart_plant` with these numbers, and the memory that it uses."""
-        geometry, parameters = geometry_of(self.mechanism).copy(), plant_parameters()
+        geometry, parameters = self.mechanism.numbers.copy(), plant_parameters()
         geometry[: LEG_NUMBERS * NUM_LEGS] = numbers.legs.T.ravel()
         parameters[:NUM_DYNAMIC] = numbers.parameters
         kept = [core().at(one) for one in (geometry, parameters, np.array([self.gravity]))]

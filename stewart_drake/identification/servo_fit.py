@@ -114,7 +114,7 @@ class ServoModel:
         """
         times = self.log.times - self.log.times[0]
         start = np.concatenate([self.log.poses[0], np.zeros(NUM_STATE // 2)])
-        plant = NativePlant(self._dynamics(theta), start, times, _ACCURACY, math.inf)
+        plant = NativePlant(self._dynamics(theta), start, times, _ACCURACY)
         plant.run.most_steps = round(_RUN_STEPS * times[-1])
         servo = PositionServo(theta[K], 0.0, self.torque_limit)
         # The first setpoint acts from the start on.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from stewart_drake.core.layout import LEG_NUMBERS
 from stewart_drake.identification.model import LEG_PLACES, NUM_DYNAMIC, NUM_GEOMETRY, Numbers
 from stewart_drake.identification.tolerances import Tolerances
-from stewart_drake.mechanism.geometry import Mechanism, drawing_of, geometry_of, plate_radius
+from stewart_drake.mechanism.geometry import Mechanism, drawing_of, plate_radius
 from stewart_drake.scenario import calibration
 from stewart_drake.scenario.signals import (
     BALL_JOINT_FRICTION_SPEED,
@@ -68,7 +68,7 @@ class Unknowns:
 
     def numbers(self, values: Array) -> Numbers:
         """Return the numbers of the machine with values (NUM_UNKNOWNS,) of the unknowns."""
-        legs = geometry_of(self.mechanism)[: LEG_NUMBERS * NUM_LEGS].reshape(-1, NUM_LEGS).T.copy()
+        legs = self.mechanism.numbers[: LEG_NUMBERS * NUM_LEGS].reshape(-1, NUM_LEGS).T.copy()
         legs[:, LEG_PLACES] = values[GEOMETRY].reshape(NUM_LEGS, -1)
         return Numbers(values[DYNAMIC], legs)
 

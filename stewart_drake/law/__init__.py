@@ -27,7 +27,7 @@ from stewart_drake.law.predictors import (
     Predictor,
 )
 from stewart_drake.law.sensing import EncoderSensing, Measurement, Sensing, StateSensing
-from stewart_drake.law.servo_preview import ServoPreview
+from stewart_drake.law.servos import ServoPreview
 from stewart_drake.law.timeline import Arrivals, Timeline
 
 __all__ = [

@@ -6,11 +6,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stewart_drake.dynamics.native_functions import functions_of
 from stewart_drake.dynamics.workspace import border
-from stewart_drake.mechanism.clearance import clearances
+from stewart_drake.mechanism.clearance import clearances, room
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.mechanism.kinematics import legs_along, reach_margins
+from stewart_drake.mechanism.kinematics import reach_margins
 from stewart_drake.scenario.signals import NUM_COORDINATES, NUM_LEGS, POSE
 from stewart_drake.types import Array
 
@@ -51,7 +50,7 @@ class ClearSpace:
         reached = poses[np.all(margins > 0, axis=1)]
         reached = reached if len(reached) else mechanism.home[None]
         legs = margins.min(axis=0) / unit
-        apart = clearances(mechanism, reached, legs_along(mechanism, reached)).min(axis=0) / unit
+        apart = clearances(mechanism, reached).min(axis=0) / unit
         pairs = np.flatnonzero(apart > 0)
         own = np.concatenate([np.where(legs > 0, legs, np.inf), apart[pairs]])
         return cls(mechanism, pairs, np.minimum(RESERVE, _KEPT_SHARE * own))
@@ -65,12 +64,13 @@ class ClearSpace:
         pairs, legs = self.pairs, np.arange(NUM_LEGS)
         chosen = np.arange(len(pairs)) if chosen is None else chosen
         least = self.least[np.concatenate([legs, NUM_LEGS + chosen])]
-        return functions_of(self.mechanism).room(poses, pairs[chosen], least)
+        unit = self.mechanism.crank_lengths.min()
+        return room(self.mechanism, poses, pairs[chosen], unit, least)
 
     def near(self, poses: Array, below: float) -> NearLimit:
         """Return the distances with less room than `below` at poses (n, 6), with their slopes."""
-        room = self.room(poses)
-        is_near = room < below
+        left = self.room(poses)
+        is_near = left < below
         near_poses = np.flatnonzero(is_near.any(axis=1))
         near_pairs = np.flatnonzero(is_near[:, NUM_LEGS:].any(axis=0))
         columns = np.concatenate([np.arange(NUM_LEGS), NUM_LEGS + near_pairs])
@@ -82,7 +82,7 @@ class ClearSpace:
         usable = is_near[near_poses][:, columns] & np.isfinite(slopes).all(axis=2)
         row, column = np.nonzero(usable)
         pose = near_poses[row]
-        return NearLimit(pose, room[pose, columns[column]], slopes[row, column])
+        return NearLimit(pose, left[pose, columns[column]], slopes[row, column])
 
     def reachable_share(self, poses: Array) -> float:
         """Return the largest share of the way from home at which all poses (n, 6) keep the reach.

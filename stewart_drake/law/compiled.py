@@ -12,7 +12,6 @@ from stewart_drake.dynamics.frozen_map import FrozenDynamics
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.nominal import NominalPlant, TorqueLimit
 from stewart_drake.law.timeline import TorqueSchedule
-from stewart_drake.mechanism.geometry import Mechanism, geometry_of
 from stewart_drake.scenario.signals import BALL_JOINTS, PLANT_PARAMETERS
 from stewart_drake.types import Array
 
@@ -138,12 +137,6 @@ def address_of(pointer: Any) -> int:
     return int(core().ffi.cast("intptr_t", pointer))
 
 
-@Once
-def geometry(mechanism: Mechanism) -> Array:
-    """Return the numbers of a machine, for C."""
-    return numbers(geometry_of(mechanism))
-
-
 def resists(dynamics: StewartDynamics) -> bool:
     """Return whether the ball joints of a plant have friction, or may have some."""
     names = PLANT_PARAMETERS[BALL_JOINTS]
@@ -154,7 +147,7 @@ def resists(dynamics: StewartDynamics) -> bool:
 @Once
 def machine_of(plant: NominalPlant) -> Compiled:
     machine, dynamics = core().ffi.new("stewart_machine *"), plant.dynamics
-    machine.geometry = list(geometry(dynamics.mechanism))
+    machine.geometry = list(dynamics.mechanism.numbers)
     machine.parameters = list(dynamics.plant_parameters)
     machine.gravity, machine.torque_limit = dynamics.gravity, plant.motors.limit
     machine.coarse_torque_limit, machine.substeps = plant.coarse_torque_limit, plant.substeps

@@ -98,9 +98,11 @@ class CompiledLaw:
             self._set_torque_law(more)
             c.lib.stewart_prepare(self.data)
         self.keep_alive += self._own_parts.keep_alive
-        layout = self.data.layout
+        layout = self.torques_law.layout
         fields = {name: getattr(layout, name) for name, _ in c.ffi.typeof(layout).fields}
-        self.fields = {name: (one.at, one.rows, one.columns) for name, one in fields.items()}
+        self.fields = {
+            name: (one.at, one.rows, one.columns) for name, one in fields.items() if one.rows
+        }
 
     def _set_common_parts(self, data: Any) -> None:
         c, law, timeline = core(), self.law, self.law.timeline
@@ -204,7 +206,7 @@ class CompiledLaw:
         Args:
             first: (n, 6) torques in flight, or for servos (18,) the command that was sent last.
         """
-        c, memory = core(), Memory(np.empty(self.data.memory), self, {})
+        c, memory = core(), Memory(np.empty(self.torques_law.memory), self, {})
         first, self._own_parts.now = numbers(first), Step(memory)
         if self._servos:
             c.lib.stewart_servo_start(self.data, c.at(memory.data), c.at(first))

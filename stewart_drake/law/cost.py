@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 
 from stewart_drake.files.arguments import fixed, positive
-from stewart_drake.law.delay_model import ContinuousModel, DelayedModel, delayed_model
+from stewart_drake.law.delay_model import DelayedModel, LinearModel, delayed_model
 from stewart_drake.law.riccati import prediction_matrix, reduced_gain
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.scenario.signals import NUM_COORDINATES, RATES
@@ -22,7 +22,7 @@ class Cost(Protocol):
         """Whether the law has an integral."""
         ...
 
-    def sampled(self, model: ContinuousModel, timeline: Timeline) -> DelayedModel:
+    def sampled(self, model: LinearModel, timeline: Timeline) -> DelayedModel:
         """Return a model of error, rates and, if there is one, integral.
 
         Raises:
@@ -42,8 +42,8 @@ class Cost(Protocol):
 
 def law_gain(
     cost: Cost,
-    design: ContinuousModel,
-    predictor: ContinuousModel,
+    design: LinearModel,
+    predictor: LinearModel,
     timeline: Timeline,
     weights: Array,
 ) -> Array:

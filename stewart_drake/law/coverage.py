@@ -7,7 +7,7 @@ from stewart_drake.law.core_law import in_python
 from stewart_drake.law.nominal import NominalPlant, TorqueLimit
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.sensing import EncoderSensing, StateSensing
-from stewart_drake.law.servo_preview import ServoPreview
+from stewart_drake.law.servos import ServoPreview
 from stewart_drake.law.timeline import Timeline
 
 _FIELDS: Final = {

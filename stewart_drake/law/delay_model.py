@@ -24,20 +24,20 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import expm
 
-from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import NUM_COORDINATES, NUM_STATE, POSE, RATES
+from stewart_drake.scenario.timing import Delay
 from stewart_drake.types import Array
 
 
-class ContinuousModel(NamedTuple):
-    """Model e_dot = A e + B T, A (n, n), B (n, m); the cost has the output y = C e, C (p, n)."""
+class LinearModel(NamedTuple):
+    """e_dot, or the next e, is A e + B T, A (n, n), B (n, m); the cost sees y = C e, C (p, n)."""
 
     A: Array
     B: Array
     C: Array
 
 
-def double_integrators(torque_map: Array) -> ContinuousModel:
+def double_integrators(torque_map: Array) -> LinearModel:
     """Return (20)-(23), a double integrator per coordinate.
 
     Its accelerations are torque_map (6, 6) times the torques; C selects the pose error.
@@ -49,19 +49,19 @@ def double_integrators(torque_map: Array) -> ContinuousModel:
     return linear_model(A, B)
 
 
-def linear_model(A: Array, B: Array) -> ContinuousModel:
+def linear_model(A: Array, B: Array) -> LinearModel:
     """Return a model whose cost has the pose error, from A (12, 12), B (12, 6) of [pose; rates]."""
-    return ContinuousModel(A, B, np.eye(NUM_COORDINATES, NUM_STATE))
+    return LinearModel(A, B, np.eye(NUM_COORDINATES, NUM_STATE))
 
 
-def with_integral(model: ContinuousModel) -> ContinuousModel:
+def with_integral(model: LinearModel) -> LinearModel:
     """Return (24)-(28): 18 states with z_dot = pose error; C selects pose error and integral."""
     n, m = model.B.shape
     p = model.C.shape[0]
     A = np.block([[model.A, np.zeros((n, p))], [model.C, np.zeros((p, p))]])
     B = np.vstack([model.B, np.zeros((p, m))])
     C = np.block([[model.C, np.zeros((p, p))], [np.zeros((p, n)), np.eye(p)]])
-    return ContinuousModel(A, B, C)
+    return LinearModel(A, B, C)
 
 
 @dataclass(frozen=True)
@@ -82,15 +82,6 @@ class DelayedModel:
     def queue_length(self) -> int:
         """Torques in flight at a sampling instant."""
         return Delay(self.steps, self.fraction).queue_length
-
-
-@dataclass(frozen=True)
-class ChainModel:
-    """Chain (38)-(39): x_{k+1} = A x_k + B T_k, y = C x, x = [e; queue, oldest torque first]."""
-
-    A: Array
-    B: Array
-    C: Array
 
 
 def sample(A: Array, B: Array, duration: float) -> tuple[Array, Array]:
@@ -128,7 +119,7 @@ def sample_in_steps(A: Array, B: Array, duration: float, step: float) -> tuple[A
 
 
 def delayed_model(
-    model: ContinuousModel,
+    model: LinearModel,
     period: float,
     steps: int,
     fraction: float = 0.0,
@@ -178,25 +169,24 @@ def delayed_model(
     return DelayedModel(A, B_old, B_new, C, steps, fraction)
 
 
-def chain(model: DelayedModel, *, always_extra: bool = False) -> ChainModel:
-    """Return the delay chain (37)-(39) as one undelayed system.
+def chain(model: DelayedModel, carried: int = 0) -> LinearModel:
+    """Return the delay chain (37)-(39) as one undelayed system of [e; queue, oldest torque first].
 
     Args:
-        always_extra: carry T_{k-mu-1} also when eta0 = 0, as the paper does.
+        carried: torques in the queue, if more than are in flight; the paper always has mu + 1.
     """
     n, m = model.B_new.shape
-    extra = always_extra or model.fraction > 0
-    length = model.steps + int(extra)
-    if length == 0:
-        return ChainModel(model.A, model.B_new, model.C)
-    A = np.zeros((n + m * length, n + m * length))
-    B = np.zeros((n + m * length, m))
+    length = max(model.queue_length, carried)
+    A, B = np.zeros((n + m * length, n + m * length)), np.zeros((n + m * length, m))
     A[:n, :n] = model.A
-    torques = [*([model.B_old] if extra else []), model.B_new]  # oldest first; the last may be T_k
-    for place, B_of_torque in enumerate(torques):
-        columns = A[:n, n + m * place :] if place < length else B[:n]
-        columns[:, :m] += B_of_torque
-    A[n : n + m * (length - 1), n + m :] = np.eye(m * (length - 1))
-    B[n + m * (length - 1) :] = np.eye(m)
+    if length:
+        A[n:-m, n + m :] = np.eye(m * (length - 1))
+        B[-m:] = np.eye(m)
+    for age, B_of_torque in ((model.steps + 1, model.B_old), (model.steps, model.B_new)):
+        if age == 0:  # acts at once
+            B[:n] += B_of_torque
+        elif age <= length:
+            place = n + m * (length - age)
+            A[:n, place : place + m] += B_of_torque
     C = np.hstack([model.C, np.zeros((model.C.shape[0], m * length))])
-    return ChainModel(A, B, C)
+    return LinearModel(A, B, C)

@@ -22,7 +22,7 @@ from stewart_drake.law.counts import Counts
 from stewart_drake.law.motion import Motion
 from stewart_drake.law.predictive_lqi import OuterLqi, OuterMemory, PredictiveLqi
 from stewart_drake.law.sensing import Measurement
-from stewart_drake.law.servo_preview import ServoPreview
+from stewart_drake.law.servos import ServoPreview
 from stewart_drake.types import Array
 
 Law = TypeVar("Law", PredictiveLqi, ServoPreview)

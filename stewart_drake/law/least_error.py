@@ -10,7 +10,7 @@ minimises its length instead of its error. Here N torques T_j are free, each hel
 with the pose errors e at the two Gauss nodes of a hold, the torques T_ff of the reference, and the
 distances of `law.clear_space`. The cost is that of `law.horizon`.
 
-Sequential quadratic programming: each program (`law.horizon_qp`) is linearised about the motion
+Sequential quadratic programming: each program (`law.horizon`) is linearised about the motion
 under the torques of the last one, and has the end state as a further constraint. A fixed point
 meets (least) and the equations of motion.
 """
@@ -31,13 +31,20 @@ from stewart_drake.law.feedforward import (
     means_and_changes,
     torques_at_nodes,
 )
-from stewart_drake.law.horizon import HoldModel, HorizonCost, condense, riccati
-from stewart_drake.law.horizon_qp import LeastDistance, problem_of, solve_by_daqp
+from stewart_drake.law.horizon import (
+    HoldModel,
+    HorizonCost,
+    LeastDistance,
+    condense,
+    problem_of,
+    riccati,
+    solve_by_daqp,
+)
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.mechanism.trajectories import evaluate, poses_along
-from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import NUM_REFERENCE, NUM_STATE, POSE, RATES
+from stewart_drake.scenario.timing import Delay
 from stewart_drake.types import Array
 
 LEAST_ERROR_SHARE: Final = 0.65

@@ -9,7 +9,7 @@ import numpy as np
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.arguments import of_kind, one_of, positive, whole
-from stewart_drake.law.delay_model import ContinuousModel, double_integrators, linear_model
+from stewart_drake.law.delay_model import LinearModel, double_integrators, linear_model
 from stewart_drake.law.timeline import TorqueSchedule
 from stewart_drake.mechanism.assembly import TorqueMap
 from stewart_drake.mechanism.geometry import Mechanism
@@ -81,7 +81,7 @@ class DesignModel(ABC):
 
     def at(
         self, state: Array, torque: Array, parameters: Array, plant: NominalPlant
-    ) -> ContinuousModel:
+    ) -> LinearModel:
         """Return the error model about a state (12,) under a torque (6,), with parameters (p,).
 
         Raises:
@@ -93,7 +93,7 @@ class DesignModel(ABC):
     @abstractmethod
     def about(
         self, state: Array, torque: Array, parameters: Array, plant: NominalPlant
-    ) -> ContinuousModel:
+    ) -> LinearModel:
         """Return the model of `at` for a pose within reach."""
 
 
@@ -112,7 +112,7 @@ class PaperModel(DesignModel):
 
     def about(
         self, state: Array, torque: Array, parameters: Array, plant: NominalPlant
-    ) -> ContinuousModel:
+    ) -> LinearModel:
         return double_integrators(plant.dynamics.massless_map(state[POSE], self.form))
 
 
@@ -122,6 +122,6 @@ class MultibodyModel(DesignModel):
 
     def about(
         self, state: Array, torque: Array, parameters: Array, plant: NominalPlant
-    ) -> ContinuousModel:
+    ) -> LinearModel:
         derivatives = plant.dynamics.derivatives(state[POSE], state[RATES], torque, parameters)
         return linear_model(derivatives.A, derivatives.B)

@@ -35,8 +35,8 @@ from stewart_drake.law.sensing import (
 )
 from stewart_drake.law.timeline import Arrivals, Timeline
 from stewart_drake.scenario.calibration import OFFSETS
-from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import NUM_LEGS, NUM_STATE, NUM_TORQUES
+from stewart_drake.scenario.timing import Delay
 from stewart_drake.types import Array
 
 OUTLIER: Final = 1e-6

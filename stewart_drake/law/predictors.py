@@ -6,7 +6,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from stewart_drake.law.belief import Belief
-from stewart_drake.law.delay_model import ContinuousModel, DelayedModel
+from stewart_drake.law.delay_model import DelayedModel, LinearModel
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.riccati import prediction_matrix
 from stewart_drake.law.timeline import Timeline
@@ -49,7 +49,7 @@ class Predictor(Protocol):
         """Return the gain (6, n) on [error; integral; pending torques] for a `reduced_gain` K."""
         ...
 
-    def model(self, design: ContinuousModel, exact: ContinuousModel) -> ContinuousModel:
+    def model(self, design: LinearModel, exact: LinearModel) -> LinearModel:
         """Return the linearised prediction, given those of the gain and of the exact equations."""
         ...
 
@@ -73,7 +73,7 @@ class LinearPredictor:
         """Return K_aug, K times the prediction by the model of the gain."""
         return K @ prediction_matrix(model)
 
-    def model(self, design: ContinuousModel, exact: ContinuousModel) -> ContinuousModel:
+    def model(self, design: LinearModel, exact: LinearModel) -> LinearModel:
         return design
 
 
@@ -94,7 +94,7 @@ class NonlinearPredictor:
     def gain(self, K: Array, model: DelayedModel) -> Array:
         return K
 
-    def model(self, design: ContinuousModel, exact: ContinuousModel) -> ContinuousModel:
+    def model(self, design: LinearModel, exact: LinearModel) -> LinearModel:
         return exact
 
 

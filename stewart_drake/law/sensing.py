@@ -19,7 +19,7 @@ import numpy as np
 from stewart_drake.core.library import core
 from stewart_drake.files.arguments import fixed, whole
 from stewart_drake.law.belief import root_of
-from stewart_drake.law.compiled import Compiled, Once, Out, call_back, geometry, numbers
+from stewart_drake.law.compiled import Compiled, Once, Out, call_back, numbers
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.signals import NUM_COORDINATES, NUM_LEGS, NUM_STATE
 from stewart_drake.types import Array, Flags
@@ -163,7 +163,7 @@ class StateSensing:
     ) -> str | None:
         """Return the fault; one missing value makes the whole measurement missing."""
         c, values, before = core(), measurement.known(self.size), numbers(last, self.size)
-        arguments = c.at(geometry(mechanism)), period, c.at(values), c.at(before)
+        arguments = c.at(mechanism.numbers), period, c.at(values), c.at(before)
         return _fault(c.lib.stewart_state_sensing(state_sensor(self).pointer), *arguments)
 
     def start(self, measurement: Measurement, near: Array | None = None) -> FirstState:
@@ -339,7 +339,7 @@ def _sensing_of(sensing: EncoderSensing) -> Compiled:
 def encoders_of(sensing: EncoderSensing) -> Compiled:
     """Return the `stewart_encoders` of encoders."""
     c, it, times = core(), core().ffi.new("stewart_encoders *"), node_times(sensing.samples)
-    machine, noise = geometry(sensing.mechanism), sensing.noise_std
+    machine, noise = sensing.mechanism.numbers, sensing.noise_std
     it.geometry, it.noise_std = c.at(machine), c.at(noise)
     it.samples, it.nodes = sensing.samples, len(times)
     it.quantum, it.std = sensing.quantum, sensing.std

@@ -1,4 +1,4 @@
-"""Position servos: a local loop at each motor follows the crank angles that arrive.
+"""Position servos: a local loop at each motor follows the crank angles that arrive; and their law.
 
 A servo is given by its bandwidth (`ServoLoop`) or by its stiffness (`Stiffness`).
 
@@ -25,9 +25,14 @@ a period. To follow a_r, whose motion takes the torque tau_r with friction and a
     u = a_r + (tau_r + k_v a_r') / k,                                             (setpoint)
 
 taken in the middle of the hold: a motion within it deviates from its mean by the second order.
+
+The law, `ServoPreview`, sends the crank angles of the reference ahead (core/servo.h). Until a
+command is reached, servos given by their bandwidth move to it from the one before (`Segment`).
+Without T_ff they need an error to produce the torque of the motion.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -36,7 +41,14 @@ import numpy as np
 
 from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
-from stewart_drake.law.nominal import TorqueLimit
+from stewart_drake.law.core_law import CompiledLaw
+from stewart_drake.law.feedforward import Feedforward, InverseDynamicsFeedforward
+from stewart_drake.law.memory import Memory
+from stewart_drake.law.motion import Motion
+from stewart_drake.law.nominal import NominalPlant, TorqueLimit
+from stewart_drake.law.observers import Observer
+from stewart_drake.law.sensing import Measurement, Sensing
+from stewart_drake.law.timeline import Timeline
 from stewart_drake.mechanism.kinematics import turned
 from stewart_drake.scenario.signals import (
     MODEL_TORQUE,
@@ -125,7 +137,7 @@ class PositionServo:
         """Return torques (2, 6) in N m, without and within the limit.
 
         Args:
-            geometry: numbers of the machine, `mechanism.geometry.geometry_of`.
+            geometry: numbers of the machine, `Mechanism.numbers`.
             setpoint: (6,) crank angles, rad.
             state: (12,) pose and rates.
         """
@@ -243,3 +255,72 @@ class ReportLayout:
         ever = at_limit.reshape(self.periods, self.parts).any(axis=1)
         rows = np.column_stack([means.reshape(self.periods, -1), ever])
         return np.concatenate([rows.ravel(), asked])
+
+
+@dataclass(frozen=True)
+class ServoPreview:
+    """The law for one machine, made of parts of `law.predictive_lqi.PredictiveLqi`.
+
+    Attributes:
+        timeline: clock and delay; `parts` as of the reports.
+        sensing: model of the sensor.
+        observer: estimates state and parameters, with the reported torques.
+        feedforward: the torque T_ff of a command.
+        reports: layout of the machine's reports.
+        servo: servos given by their stiffness, None for others.
+        learned: correction (n, 6) of the angles at instants (n,) of the motion, which begins with
+            the first sample, in rad and s; None: none.
+    """
+
+    timeline: Timeline
+    plant: NominalPlant
+    sensing: Sensing
+    observer: Observer
+    feedforward: Feedforward
+    reports: ReportLayout
+    servo: Stiffness | None = None
+    learned: Callable[[Array], Array] | None = None
+
+    @cached_property
+    def preview_times(self) -> Array:
+        """Instant (1,) at which the next command is to be reached, s from now."""
+        share = 1.0 if self.servo is None else 0.5
+        return np.array([self.timeline.eta + share * self.timeline.period])
+
+    def command(self, wanted: Array, parameters: Array) -> Array:
+        """Return the command (18,) for pose, rates and accelerations (18,), with parameters (p,).
+
+        Raises:
+            UnreachablePoseError: the pose is out of reach.
+        """
+        angles = self.plant.mechanism.crank_angles(wanted[POSE])
+        rates = self.plant.dynamics.actuation_map(wanted[POSE]).T @ wanted[RATES]
+        torque = self.feedforward.at(wanted, self.plant.dynamics, parameters)
+        if self.servo is not None:
+            moves = isinstance(self.feedforward, InverseDynamicsFeedforward)
+            angles = self.servo.setpoint(angles, rates * moves, torque)
+        return np.concatenate([angles, rates, torque])
+
+    @cached_property
+    def _compiled(self) -> CompiledLaw:
+        return CompiledLaw(self)
+
+    def initial_memory(self, command: Array) -> Memory:
+        """Return the memory before the first sample, with the command (18,) that was sent last."""
+        return self._compiled.start(command)
+
+    def step(
+        self, memory: Memory, measurement: Measurement, motion: Motion, report: Array
+    ) -> Memory:
+        """Compute the command of one sample.
+
+        Args:
+            memory: after the last sample.
+            measurement: of `sensing`; its age may be that of an earlier sample.
+            motion: to follow. It is evaluated once, at `preview_times`.
+            report: as of `reports`, that came with the measurement; NaN for none.
+
+        Returns:
+            The new memory; its command (18,) is finite.
+        """
+        return self._compiled.step(memory, measurement, motion, report)

@@ -21,15 +21,15 @@ for every relative error of the motors below 1 / max |T|.
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from stewart_drake.law.delay_model import ContinuousModel, DelayedModel, delayed_model
-from stewart_drake.scenario.delay import Delay
+from stewart_drake.law.delay_model import DelayedModel, LinearModel, chain, delayed_model
+from stewart_drake.scenario.timing import Delay
 from stewart_drake.types import Array, Complex
 
 SLOWEST_POLE: Final = 1e-3
@@ -107,26 +107,17 @@ def closed_loop(plant: DelayedModel, K: Array, gain: float = 1.0) -> Array:
     """
     n, m = plant.B_new.shape
     believed = (K.shape[1] - n) // m
-    length = max(plant.queue_length, believed)
-    control = np.hstack([K[:, :n], np.zeros((m, m * (length - believed))), K[:, n:]])
-    A = np.zeros((n + m * length, n + m * length))
-    A[:n, :n] = plant.A
-    if length:
-        A[n:-m, n + m :] = np.eye(m * (length - 1))
-        A[-m:] = -control
-    for age, B in ((plant.steps + 1, plant.B_old), (plant.steps, plant.B_new)):
-        if age == 0:  # acts at once
-            A[:n] -= gain * B @ control
-        elif age <= length:
-            A[:n, n + m * (length - age) : n + m * (length - age + 1)] += gain * B
-    return A
+    driven = replace(plant, B_old=gain * plant.B_old, B_new=gain * plant.B_new)
+    line = chain(driven, believed)
+    unused = np.zeros((m, len(line.A) - K.shape[1]))
+    return line.A - line.B @ np.hstack([K[:, :n], unused, K[:, n:]])
 
 
 @dataclass(frozen=True)
 class LinearLoop:
     """True plant with the linearised law."""
 
-    plant: ContinuousModel  # the true one, without integral states
+    plant: LinearModel  # the true one, without integral states
     K: Array  # (m, n + m L) of (law)
     period: float  # s
     delay: Delay  # the true one

@@ -17,7 +17,6 @@ from stewart_drake.law.clear_space import ClearSpace
 from stewart_drake.law.feedforward import mean_torques
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.trajectories import evaluate, poses_along, rows_along, spread_instants
-from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import (
     COULOMB,
     COULOMB_SPEED,
@@ -26,6 +25,7 @@ from stewart_drake.scenario.signals import (
     PLANT_PARAMETERS,
     POSE,
 )
+from stewart_drake.scenario.timing import Delay
 from stewart_drake.types import Array
 
 PREDICTION_BUDGET = 2e-5

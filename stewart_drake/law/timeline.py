@@ -11,8 +11,8 @@ import numpy as np
 
 from stewart_drake.core.library import core
 from stewart_drake.files.arguments import of_kind, positive
-from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import NUM_TORQUES
+from stewart_drake.scenario.timing import Delay
 from stewart_drake.types import Array
 
 

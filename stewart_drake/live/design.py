@@ -23,7 +23,7 @@ from stewart_drake.law.limited import LimitedLqi
 from stewart_drake.law.motion import KnownMotion
 from stewart_drake.law.nominal import TorqueLimit
 from stewart_drake.law.sensing import Measurement
-from stewart_drake.law.servo_preview import ServoPreview
+from stewart_drake.law.servos import ServoPreview
 from stewart_drake.live.contact import Link
 from stewart_drake.live.protocol import MOST_HISTORY, MachineFlags, MachineMessage
 from stewart_drake.loop.law_design import control_law, first_queue

@@ -13,12 +13,12 @@ import numpy as np
 from pydrake.systems.analysis import SimulatorStatus
 
 from stewart_drake.core.link import Link
-from stewart_drake.dynamics.open_loop import IntegrationError, integrate
+from stewart_drake.dynamics.open_loop import IntegrationError, NativePlant
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.live.protocol import MISSING, MOST_HISTORY, NEVER, SECOND, Refusal
-from stewart_drake.loop.bulk import LONGEST_STEP, SHARE
+from stewart_drake.loop.bulk import SHARE
 from stewart_drake.loop.diagram import build_machine
 from stewart_drake.loop.peer import code_bits
 from stewart_drake.loop.preparation import Experiment
@@ -247,12 +247,13 @@ class NativeBody:
         dynamics = self._pushed if any(push.at(self.time)) else self._free
         try:
             command = torque if self._servo is not None else torque + self._bias
-            how = (time - self.time,), self._accuracy, LONGEST_STEP, self._servo
-            course = integrate(dynamics, self.state, command, *how)
+            until = np.array([time - self.time])
+            plant = NativePlant(dynamics, self.state, until, self._accuracy)
+            left = plant.failure(plant.hold([0.0], [command], self._servo))
         except IntegrationError as error:
             return Failure(self.time, None, np.nan, str(error))
-        began, left = self.time, course.failure
-        self.state, self.time = course.final, time if left is None else began + course.end
+        began = self.time
+        self.state, self.time = plant.final, time if left is None else began + plant.run.time
         return None if left is None else left._replace(time=began + left.time)
 
     def measurement(self) -> Array:

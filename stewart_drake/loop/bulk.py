@@ -27,7 +27,7 @@ from stewart_drake.law.coverage import backend, uncovered_part
 from stewart_drake.law.motion import KnownMotion
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.sensing import Measurement
-from stewart_drake.law.servo_preview import ServoPreview
+from stewart_drake.law.servos import ServoPreview
 from stewart_drake.loop.law_design import (
     catch_up_of,
     compose_law,
@@ -76,8 +76,6 @@ from stewart_drake.types import Array, Flags
 SHARE: Final = 0.1
 """Tolerance of an integration step over the scenario's accuracy. With steps of order 8, one more
 digit costs a sixth more time."""
-LONGEST_STEP: Final = np.inf
-"""Longest integration step, s. The state is recorded every 20 ms for steps of any length."""
 COVERED: Final[Accepted] = {
     "plant.kind": "exact",
     "actuator.kind": ("torque", "position_servo"),
@@ -396,7 +394,7 @@ def run_loop(
     sc, sensor, number = experiment.scenario, experiment.scenario.sensor, len(when.samples)
     assert sensor.kind == "state"
     truth, accuracy = experiment.true_dynamics(biased=False), SHARE * sc.plant.accuracy
-    plant = NativePlant(truth, experiment.start, when.looks, accuracy, LONGEST_STEP)
+    plant = NativePlant(truth, experiment.start, when.looks, accuracy)
     noise, c = np.array(sensor.noise_std), core()
     drawn = noise * white_noises(sensor.seed, number) if noise.any() else None
     channel = law.channel if isinstance(law, PredictiveLqi) else None

@@ -17,7 +17,7 @@ from stewart_drake.loop.results import RunSummary
 from stewart_drake.loop.servos import quickest_crank
 from stewart_drake.scenario.calibration import believed_delay
 from stewart_drake.scenario.config import DelayConfig, Scenario
-from stewart_drake.scenario.delay import Delay
+from stewart_drake.scenario.timing import Delay
 
 TOLERABLE: Final = 1e5
 """Growth of an error along the motion, by a step of the plant, above which there is a warning.

@@ -17,9 +17,8 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder
 
 from stewart_drake.loop.platforms import add_mechanism, add_scene, set_pose
-from stewart_drake.mechanism.clearance import LINKS, center_lines, proportions, segment_distances
+from stewart_drake.mechanism.clearance import LINK_PAIRS, LINKS, clearances
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.mechanism.kinematics import legs_along
 from stewart_drake.types import Array
 
 _AT_REST: Final = np.zeros(6)
@@ -68,7 +67,8 @@ class ClearanceScene:
         self._ids = [(parts[pair.first], parts[pair.second]) for pair in self.pairs]
         two_rods = np.array([all(_kind(name) == "rod" for name in pair) for pair in self.pairs])
         self._rod_pairs, self._other_pairs = np.flatnonzero(two_rods), np.flatnonzero(~two_rods)
-        self._rods = np.array([[LINKS.index(n) for n in self.pairs[k]] for k in self._rod_pairs]).T
+        rods = (tuple(map(LINKS.index, self.pairs[k])) for k in self._rod_pairs)
+        self._rods = [LINK_PAIRS.index(pair) for pair in rods]
 
     def distances(self, pose: Array) -> Array:
         """Return the distances of all pairs (p,), in m, at a pose (6,); negative for an overlap.
@@ -76,19 +76,15 @@ class ClearanceScene:
         Raises:
             UnreachablePoseError: the pose is out of reach.
         """
-        m = self._mechanism
-        set_pose(self._plant, self._plant_context, m, pose, _AT_REST)
+        set_pose(self._plant, self._plant_context, self._mechanism, pose, _AT_REST)
         query = cast(QueryObject, self._query_port.Eval(self._scene_context))
         distances = np.empty(len(self.pairs))
         distances[self._other_pairs] = [
             query.ComputeSignedDistancePairClosestPoints(*self._ids[k]).distance
             for k in self._other_pairs
         ]
-        poses = np.asarray(pose)[None]
-        start, along = (lines[0] for lines in center_lines(m, poses, legs_along(m, poses)))
-        first, second = self._rods
-        apart = segment_distances(start[first], along[first], start[second], along[second])
-        distances[self._rod_pairs] = apart - 2 * proportions(m).rod_radius
+        apart = clearances(self._mechanism, np.asarray(pose)[None])[0]
+        distances[self._rod_pairs] = apart[self._rods]
         return distances
 
 

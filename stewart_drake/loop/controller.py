@@ -16,7 +16,7 @@ from stewart_drake.law.memory import Memory
 from stewart_drake.law.motion import KnownMotion, Motion, Preview
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.sensing import Measurement
-from stewart_drake.law.servo_preview import ServoPreview
+from stewart_drake.law.servos import ServoPreview
 from stewart_drake.loop.sampling import Sample, SteppedLaw, declare_constant, weak
 from stewart_drake.mechanism.trajectories import evaluate, rows_along
 from stewart_drake.scenario.signals import (
@@ -238,7 +238,7 @@ class DelayLqiController(_RecordedLaw):
 class ServoController(_RecordedLaw):
     """Controller for servos: sends crank angles ahead of time.
 
-    With m the memory and `step` the law (`law.servo_preview.ServoPreview`):
+    With m the memory and `step` the law (`law.servos.ServoPreview`):
 
     Update:  every period m <- step(m, measurement, preview, report), and the time it took
     Output:  command = step(m, measurement, preview, report).command, to be read at the samples;

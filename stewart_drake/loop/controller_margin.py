@@ -39,7 +39,7 @@ from stewart_drake.dynamics.workspace import margin
 from stewart_drake.files.arguments import fixed, of_kind
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.cost import law_gain
-from stewart_drake.law.delay_model import ContinuousModel, chain, linear_model
+from stewart_drake.law.delay_model import LinearModel, chain, linear_model
 from stewart_drake.law.nominal import MultibodyModel
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.riccati import RiccatiError
@@ -310,7 +310,7 @@ def _order(radii: list[float]) -> list[int]:
     return [first, last, *(int(i) for i in np.random.default_rng(0).permutation(between))]
 
 
-def true_model(experiment: Experiment, truth: StewartDynamics, time: float) -> ContinuousModel:
+def true_model(experiment: Experiment, truth: StewartDynamics, time: float) -> LinearModel:
     """Return the plant about the moving reference at `time` in s, under its inverse dynamics."""
     x = evaluate(experiment.reference, time)
     torque = truth.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS])

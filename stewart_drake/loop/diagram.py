@@ -29,9 +29,8 @@ from stewart_drake.loop.kinds import make_link, make_plant, make_sensor, wire
 from stewart_drake.loop.law_design import control_law, first_queue, followed_motion
 from stewart_drake.loop.link import LateMeasurements
 from stewart_drake.loop.own import OwnSystems
-from stewart_drake.loop.platforms import StartCheck, add_to_torque
+from stewart_drake.loop.platforms import Push, StartCheck, add_to_torque
 from stewart_drake.loop.preparation import Experiment, as_experiment
-from stewart_drake.loop.push import Push
 from stewart_drake.loop.servos import (
     PositionServos,
     Servos,

@@ -36,6 +36,7 @@ from stewart_drake.scenario.signals import (
     PLANT_PARAMETERS,
     POSE,
     RATES,
+    WRENCH,
 )
 from stewart_drake.scenario.timing import METRIC_PERIOD
 from stewart_drake.types import ArrayLike
@@ -79,8 +80,8 @@ def ExactPlant_(T):
     class Impl(LeafSystem_[T]):
         """A mechanism's plate under motor torques, loops closed exactly.
 
-        Dynamics:  d[pose; rates]/dt = [rates; accelerations(pose, rates, torque)], plus those of a
-                   wrench, `StewartDynamics.wrench_accelerations`.
+        Dynamics:  d[pose; rates]/dt = [rates; accelerations(pose, rates, torque)], with the input
+                   `wrench` added to that of parameter 0.
         Witness:   the margin of its limits, of a machine the least of `dynamics.workspace.margin`;
                    the simulation ends where it passes zero: a leg at a dead centre, a parallel
                    singularity, a pitch of 85 degrees.
@@ -153,19 +154,16 @@ def ExactPlant_(T):
         def DoCalcTimeDerivatives(self, context, derivatives) -> None:
             x = context.get_continuous_state_vector().CopyToVector()
             torque, dynamics = self._torque.Eval(context), self._dynamics.Eval(context)
-            wrench = None
+            parameters = context.get_numeric_parameter(0).CopyToVector()
             if self._wrench is not None and self._wrench.HasValue(context):
-                wrench = self._wrench.Eval(context)
+                parameters[WRENCH] += self._wrench.Eval(context)
             if T is float:
-                change = dynamics.change(x, torque)
+                change = dynamics.change(x, torque, parameters)
                 # The integrator would shorten its steps for ever. Each acceleration needs all.
                 if not math.isfinite(change[-1]) and not np.isfinite(torque).all():
                     raise ValueError(f"torque: got {torque.tolist()}; expected finite numbers, N m")
-                if wrench is not None:
-                    change[RATES] += dynamics.wrench_accelerations(x[POSE], wrench)
             else:
-                parameters = context.get_numeric_parameter(0).CopyToVector()
-                change = self._with_gradient(dynamics, x, torque, parameters, wrench)
+                change = self._with_gradient(dynamics, x, torque, parameters)
             derivatives.SetFromVector(change)
 
         def _calc_dynamics(self, context, result) -> None:
@@ -187,21 +185,12 @@ def ExactPlant_(T):
             result.set_value(d)
 
         @staticmethod
-        def _with_gradient(d, x, torque, parameters, wrench):
-            """Return d(x_dot) = A dx + B dT + G dp + (M N)^-1 dF, F the wrench."""
-            value, tau = ExtractValue(x).ravel(), ExtractValue(torque).ravel()
-            pose, rates = value[POSE], value[RATES]
-            force = None if wrench is None else ExtractValue(wrench).ravel()
-            at = d.derivatives(pose, rates, tau, wrench=force)
-            inputs, maps = [x, torque, parameters], [at.A, at.B, at.G]
-            a = d.accelerations(pose, rates, tau)
-            if force is not None:
-                a += d.wrench_accelerations(pose, force)
-                columns = [d.wrench_accelerations(pose, unit) for unit in np.eye(6)]
-                inputs.append(wrench)
-                maps.append(np.vstack([np.zeros((6, 6)), np.column_stack(columns)]))
-            gradient = np.hstack(maps) @ ExtractGradient(np.concatenate(inputs))
-            return InitializeAutoDiff(np.concatenate([rates, a]), gradient).ravel()
+        def _with_gradient(d, x, torque, parameters):
+            """Return d(x_dot) = A dx + B dT + G dp."""
+            state, tau, values = (ExtractValue(part).ravel() for part in (x, torque, parameters))
+            at = d.derivatives(state[POSE], state[RATES], tau, values)
+            gradient = np.hstack(at) @ ExtractGradient(np.concatenate([x, torque, parameters]))
+            return InitializeAutoDiff(d.change(state, tau, values), gradient).ravel()
 
         def set_state(self, context, state) -> None:
             """Put the plate, in this system's context, into [pose; rates] (12,)."""

@@ -90,7 +90,6 @@ from stewart_drake.mechanism.trajectories import (
 )
 from stewart_drake.scenario.calibration import OFFSETS, believed_delay
 from stewart_drake.scenario.config import ControllerConfig, Scenario, StateSensorConfig
-from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.dependencies import differing
 from stewart_drake.scenario.field_types import MOST_PERIODS
 from stewart_drake.scenario.link import oldest
@@ -107,7 +106,7 @@ from stewart_drake.scenario.signals import (
     POSE,
     WRENCHES,
 )
-from stewart_drake.scenario.timing import multiple_problem
+from stewart_drake.scenario.timing import Delay, multiple_problem
 from stewart_drake.types import Array, ArrayLike
 
 LONGEST_REPLAN = 0.4

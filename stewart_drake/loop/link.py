@@ -17,10 +17,9 @@ from stewart_drake.files.arguments import fixed, of_kind, one_of, positive, whol
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.yamlio import brief
 from stewart_drake.loop.sampling import ONCE, declare_constant, update_every, weak
-from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.link import SIMULTANEOUS, releases
 from stewart_drake.scenario.signals import CARRIED, NUM_TORQUES, PACKETS, Carried
-from stewart_drake.scenario.timing import event_time
+from stewart_drake.scenario.timing import Delay, event_time
 from stewart_drake.types import Array
 
 

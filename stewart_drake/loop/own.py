@@ -15,7 +15,7 @@ from pydrake.trajectories import FunctionHandleTrajectory, Trajectory
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.predictive_lqi import PredictiveLqi
-from stewart_drake.law.servo_preview import ServoPreview
+from stewart_drake.law.servos import ServoPreview
 from stewart_drake.mechanism.trajectories import evaluate
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.dependencies import Accepted, differing

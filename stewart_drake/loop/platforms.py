@@ -1,6 +1,7 @@
 """Platforms in a diagram: the multibody plant, and `AddStewartPlatform`."""
 
 import dataclasses
+import math
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, Unpack, cast
@@ -32,6 +33,7 @@ from pydrake.systems.framework import (
     Context,
     Diagram,
     DiagramBuilder,
+    DiscreteValues,
     EventStatus,
     InputPort,
     LeafSystem,
@@ -45,13 +47,13 @@ from stewart_drake.dynamics.workspace import Failure, diagnose, measures_at
 from stewart_drake.files.arguments import fixed, of_kind
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.loop.exact import ExactPlant, Loads, checked_loads, plate_of_mass
-from stewart_drake.loop.sampling import free_name, weak
+from stewart_drake.loop.sampling import ONCE, free_name, weak
 from stewart_drake.mechanism.assembly import joint_state
 from stewart_drake.mechanism.files import as_mechanism
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import angle_rate_map
 from stewart_drake.mechanism.sdformat import to_sdformat
-from stewart_drake.scenario.config import PlantConfig
+from stewart_drake.scenario.config import PlantConfig, PushConfig
 from stewart_drake.scenario.signals import (
     ANGLES,
     LEGS,
@@ -61,6 +63,7 @@ from stewart_drake.scenario.signals import (
     POSITION,
     RATES,
 )
+from stewart_drake.scenario.timing import event_time
 from stewart_drake.types import Array, ArrayLike
 
 _LARGEST_TILT = 1e-6
@@ -750,4 +753,32 @@ class StartCheck(LeafSystem):
                 "simulator with Simulator(loop, loop.CreateDefaultContext())",
                 stacklevel=2,
             )
+        return EventStatus.Succeeded()
+
+
+class Push(LeafSystem):
+    """A constant wrench between two times.
+
+    Initialise: u = wrench if the push starts at 0 s, else 0.
+    Update:     at `start` u <- wrench, at `end` u <- 0, before a discrete plant's step from there,
+                so that integrators stop at both.
+    Output:     wrench = u.
+
+    | port | direction | size | unit | rate |
+    | --- | --- | --- | --- | --- |
+    | wrench | output | 6, moment then force, in W at the plate's COM | N m, N | held |
+    """
+
+    def __init__(self, push: PushConfig) -> None:
+        super().__init__()
+        self._wrench = np.array(push.wrench)
+        held = self.DeclareDiscreteState(np.array(push.at(0.0)))
+        self.DeclareStateOutputPort("wrench", held)
+        for time, share in ((push.start, 1.0), (push.end, 0.0)):
+            if 0 < time < math.inf:
+                change = weak(self._change, share)
+                self.DeclarePeriodicDiscreteUpdateEvent(ONCE, event_time(time), change)
+
+    def _change(self, share: float, context: Context, state: DiscreteValues) -> EventStatus:
+        state.get_mutable_vector().SetFromVector(share * self._wrench)
         return EventStatus.Succeeded()

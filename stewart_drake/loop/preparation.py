@@ -33,7 +33,6 @@ from stewart_drake.scenario.calibration import (
     calibration_file,
 )
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.loading import as_scenario
 from stewart_drake.scenario.signals import (
     ANGLES,
@@ -50,6 +49,7 @@ from stewart_drake.scenario.signals import (
     SHAFTS,
     WRENCHES,
 )
+from stewart_drake.scenario.timing import Delay
 from stewart_drake.tuner.network import DEFAULT, Network, load_network
 from stewart_drake.types import Array
 

@@ -28,12 +28,12 @@ from stewart_drake.law.learned import with_learned
 from stewart_drake.law.nominal import TorqueLimit
 from stewart_drake.law.observers import CoreObserver
 from stewart_drake.law.predictive_lqi import PredictiveLqi
-from stewart_drake.law.servo_preview import ServoPreview
 from stewart_drake.law.servos import (
     PositionServo,
     ReportLayout,
     Segment,
     ServoLoop,
+    ServoPreview,
     Stiffness,
     crank_mobility,
     mean_inertia,
@@ -46,7 +46,6 @@ from stewart_drake.loop.learned import learned_signal
 from stewart_drake.loop.own import NOTHING
 from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.sampling import SteppedLaw, update_every, weak
-from stewart_drake.mechanism.geometry import geometry_of
 from stewart_drake.mechanism.trajectories import (
     RESTING,
     SAME,
@@ -57,7 +56,6 @@ from stewart_drake.mechanism.trajectories import (
     spread_instants,
 )
 from stewart_drake.scenario.config import Scenario, compatible_actuator
-from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import (
     ACCELERATIONS,
     MODEL_TORQUE,
@@ -68,7 +66,7 @@ from stewart_drake.scenario.signals import (
     RATES,
     SETPOINT,
 )
-from stewart_drake.scenario.timing import servo_ticks, servo_time
+from stewart_drake.scenario.timing import Delay, servo_ticks, servo_time
 from stewart_drake.types import Array
 
 
@@ -199,7 +197,7 @@ class PositionServos(LeafSystem):
         reports: ReportLayout,
     ) -> None:
         super().__init__()
-        self._geometry = geometry_of(dynamics.mechanism)
+        self._geometry = dynamics.mechanism.numbers
         self._first = fixed("command", command, (NUM_REFERENCE,))
         self._servo, self.reports = servo, reports
         self._part = positive("period", period) / reports.parts

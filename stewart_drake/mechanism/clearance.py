@@ -6,21 +6,25 @@ less both radii is a lower bound of the links' distance. `loop.clearance` measur
 themselves, with plate and base.
 """
 
+from functools import lru_cache
 from itertools import combinations
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from stewart_drake.mechanism.kinematics import LegGeometry, Legs, dot
-from stewart_drake.scenario.signals import LEGS, NUM_LEGS, POSITION
+from stewart_drake.core.library import core
+from stewart_drake.mechanism.kinematics import Legs, numbers_of
+from stewart_drake.scenario.signals import LEGS, NUM_LEGS
 from stewart_drake.types import Array
 
 LINKS: Final = tuple(f"{kind} {leg}" for kind in ("crank", "rod") for leg in LEGS)
-"""Names of the links, in the order of `center_lines`."""
+"""Names of the links, in the order of core/clearance.h."""
 LINK_PAIRS: Final = tuple(
     (i, j) for i, j in combinations(range(2 * NUM_LEGS), 2) if j - i != NUM_LEGS
 )
 """Pairs (60) of links without a common joint: all but a crank and its own rod."""
+_LINK_PAIRS: Final = np.array(LINK_PAIRS, np.intc)
 
 
 class Proportions(NamedTuple):
@@ -41,38 +45,6 @@ def proportions(mechanism: Legs) -> Proportions:
     return Proportions(crank, 1.6 * crank, 0.22 * u, 0.40 * u, 0.012 * rod, 0.03 * rod)
 
 
-def center_lines(mechanism: Legs, poses: Array, legs: LegGeometry) -> tuple[Array, Array]:
-    """Return the lines of cranks, then rods, at poses (n, 6) whose legs are `legs`.
-
-    These are the starts in W, m, and the vectors from there to the ends, (n, 12, 3).
-    """
-    cranks = mechanism.crank_lengths[:, None] * legs.crank
-    rods = mechanism.rod_lengths[:, None] * legs.rod
-    joints = poses[:, None, POSITION] + legs.p_PQ_W
-    shafts = np.broadcast_to(mechanism.p_WS, joints.shape)
-    return np.hstack([shafts, joints - rods]), np.hstack([cranks, rods])
-
-
-def segment_distances(p: Array, u: Array, q: Array, v: Array) -> Array:
-    """Return distances (...) of the segments p + s u and q + t v, 0 <= s, t <= 1; arrays (..., 3).
-
-    |r + s u - t v|^2, r = p - q, is convex in (s, t). Over all s and t it is least where
-    s (u.u v.v - (u.v)^2) = (u.v)(v.r) - (u.r)(v.v). That s is cut to the segment, then the best t
-    for it, and then the best s for that t: if one of the three was cut, the minimum over the
-    square lies on its border, and these steps end there. Parallel lines have many minima, and s = 0
-    leads to one. Lengths are not zero.
-    """
-    r = p - q
-    uu, vv, uv = dot(u, u), dot(v, v), dot(u, v)
-    ur, vr = dot(u, r), dot(v, r)
-    area = uu * vv - uv**2
-    skew = area > 1e-14 * uu * vv
-    s = np.clip(np.where(skew, (uv * vr - ur * vv) / np.where(skew, area, 1.0), 0.0), 0.0, 1.0)
-    t = np.clip((uv * s + vr) / vv, 0.0, 1.0)
-    s = np.clip((uv * t - ur) / uu, 0.0, 1.0)
-    return np.sqrt(dot(d := r + s[..., None] * u - t[..., None] * v, d))
-
-
 def link_radii(mechanism: Legs) -> Array:
     """Return the radii (12,) of the links' capsules, m."""
     size = proportions(mechanism)
@@ -80,10 +52,30 @@ def link_radii(mechanism: Legs) -> Array:
     return np.repeat([crank, size.rod_radius], NUM_LEGS)
 
 
-def clearances(mechanism: Legs, poses: Array, legs: LegGeometry) -> Array:
-    """Return lower bounds (n, 60) of the distances of the pairs `LINK_PAIRS`, m, also negative."""
-    first, second = np.transpose(LINK_PAIRS)
-    start, along = center_lines(mechanism, poses, legs)
-    lines = start[:, first], along[:, first], start[:, second], along[:, second]
-    radii = link_radii(mechanism)
-    return segment_distances(*lines) - radii[first] - radii[second]
+@lru_cache(maxsize=64)
+def _capsules(mechanism: Legs) -> tuple[Array, Array]:
+    """Return the numbers of the legs, and the radii of their links, for C."""
+    return numbers_of(mechanism), link_radii(mechanism)
+
+
+def room(
+    mechanism: Legs, poses: Array, pairs: NDArray[np.integer], unit: float, least: Array
+) -> Array:
+    """Return reach margins and clearances (n, 6 + k) of poses (n, 6) above `least` (6 + k,).
+
+    All are in units of `unit` m; `pairs` (k,) are indices in LINK_PAIRS. See core/clearance.h.
+    """
+    rows, links = np.array(poses, np.float64), _LINK_PAIRS[pairs]
+    numbers, radii = _capsules(mechanism)
+    found = np.empty((len(rows), len(least)))
+    core().call("room", numbers, len(rows), rows, len(links), links, radii, unit, least, found)
+    return found
+
+
+def clearances(mechanism: Legs, poses: Array) -> Array:
+    """Return lower bounds (n, 60) of the distances of the pairs LINK_PAIRS, m, also negative.
+
+    They are NaN for links of a leg out of reach.
+    """
+    pairs, least = np.arange(len(LINK_PAIRS)), np.zeros(NUM_LEGS + len(LINK_PAIRS))
+    return room(mechanism, poses, pairs, 1.0, least)[:, NUM_LEGS:]

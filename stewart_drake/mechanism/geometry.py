@@ -29,7 +29,7 @@ from stewart_drake.types import Array, ArrayLike
 RESERVED_NAMES: Final = ("world", "WorldModelInstance", "DefaultModelInstance")
 """Names that SDFormat and Drake keep for themselves."""
 THINNESS: Final = 20.0  # length over diameter of an estimated crank or rod
-_BRANCHES: Final = slice(2 * NUM_LEGS, 3 * NUM_LEGS)  # place of the crank branches in `geometry_of`
+_BRANCHES: Final = slice(2 * NUM_LEGS, 3 * NUM_LEGS)  # place of the crank branches in the numbers
 
 
 @dataclass(frozen=True)
@@ -129,13 +129,18 @@ class Mechanism(kinematics.Legs):
         return f"Mechanism({self.name!r}, cranks {cranks} mm, rods {rods} mm)"
 
     @cached_property
-    def _numbers(self) -> Array:
-        return geometry_of(self)
+    def numbers(self) -> Array:
+        """The numbers (133,) of the machine as the core takes them, see `core.layout`."""
+        legs = *kinematics.numbers_of(self), *self.ball_joints.ravel()
+        crank = [self.crank.mass, self.crank.center, self.crank.inertia[2]]
+        rod = [self.rod.mass, self.rod.center, *self.rod.inertia]
+        plate = [self.plate.mass, *self.plate.inertia]
+        return np.array([*legs, *plate, *crank, *rod, plate_radius(self)])
 
     @cached_property
     def _key(self) -> tuple[object, ...]:
         bodies = (x for b in (self.base, self.crank) for x in (b.mass, *b.inertia))
-        numbers = np.array([*self.home, *bodies, *self._numbers])
+        numbers = np.array([*self.home, *bodies, *self.numbers])
         return self.name, self.effort_limit, numbers.tobytes()
 
     def __eq__(self, other: object) -> bool:
@@ -222,7 +227,7 @@ class Mechanism(kinematics.Legs):
             ForwardKinematicsError: no such pose on the mechanism's crank branches.
         """
         guess = self.home if guess is None else _six("guess", guess)
-        angles, numbers = _six("crank_angles", crank_angles), self._numbers
+        angles, numbers = _six("crank_angles", crank_angles), self.numbers
         pose = _pose_of(numbers, angles, guess)
         if pose is not None:
             return pose
@@ -258,24 +263,6 @@ def _pose_of(numbers: Array, angles: Array, guess: Array) -> Array | None:
 def plate_radius(mechanism: kinematics.Legs) -> float:
     """Return the mean distance of the plate's joints from its COM, m."""
     return float(np.linalg.norm(mechanism.p_PQ, axis=1).mean())
-
-
-def geometry_of(mechanism: Mechanism) -> Array:
-    """Return the numbers of a machine as the core takes them, see `core.layout`.
-
-    Leg by leg within each number: lengths of crank and rod, branch, R_WS by columns, p_PQ, p_WS,
-    friction at crank tip and plate joint.
-    Then mass and inertia of the plate; mass, centre and inertia about the motor axis of the crank;
-    mass, centre and inertia of the rod; the plate's mean radius.
-    """
-    m = mechanism
-    R_WS = m.R_WS.transpose(0, 2, 1).reshape(NUM_LEGS, 9)
-    lengths = m.crank_lengths, m.rod_lengths, m.branches
-    legs = np.column_stack([*lengths, R_WS, m.p_PQ, m.p_WS, m.ball_joints.T])
-    crank = [m.crank.mass, m.crank.center, m.crank.inertia[2]]
-    rod = [m.rod.mass, m.rod.center, *m.rod.inertia]
-    plate = [m.plate.mass, *m.plate.inertia]
-    return np.array([*legs.T.ravel(), *plate, *crank, *rod, plate_radius(m)])
 
 
 def fingerprint(mechanism: Mechanism) -> str:

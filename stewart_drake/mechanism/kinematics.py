@@ -36,6 +36,13 @@ class Legs:
     branches: Array  # (6,) of -1 or +1, the crank solution that a leg uses
 
 
+def numbers_of(legs: Legs) -> Array:
+    """Return the numbers (108,) of the legs as the core takes them, see `core.layout`."""
+    R_WS = legs.R_WS.transpose(0, 2, 1).reshape(-1, 9)
+    lengths = legs.crank_lengths, legs.rod_lengths, legs.branches
+    return np.column_stack([*lengths, R_WS, legs.p_PQ, legs.p_WS]).T.ravel()
+
+
 class UnreachablePoseError(ValueError):
     """Error for a pose out of reach: `margins` (6,) in m of `legs` (from one) are negative."""
 

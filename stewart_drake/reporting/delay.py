@@ -15,7 +15,7 @@ from stewart_drake.loop.controller_margin import ControllerMargin
 from stewart_drake.reporting.document import Document, Table, Tone, from_template, number
 from stewart_drake.reporting.panels import Curve, Panel, draw
 from stewart_drake.reporting.style import DATA_INK, DATA_PAPER, line
-from stewart_drake.scenario.delay import Delay
+from stewart_drake.scenario.timing import Delay
 from stewart_drake.studies.delay import Cell, DelayStudy, MotorMargins
 from stewart_drake.studies.verdict import HARDLY, NO, fragile, milliseconds, scenario_verdict
 

@@ -12,7 +12,6 @@ from stewart_drake.files.fileio import write_whole
 from stewart_drake.files.jsonio import jsonable
 from stewart_drake.files.yamlio import load_yaml, validate, yaml_text
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.field_types import section
 from stewart_drake.scenario.signals import (
     BALL_JOINT_FRICTION_SPEED,
@@ -20,6 +19,7 @@ from stewart_drake.scenario.signals import (
     COULOMB_SPEED,
     LEGS,
 )
+from stewart_drake.scenario.timing import Delay
 from stewart_drake.types import Array
 
 DELAY: Final = "delay"  # name of the delay of a torque, s

@@ -16,7 +16,6 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import resolve, shipped
 from stewart_drake.files.schema import ByKind
 from stewart_drake.files.yamlio import brief, differences, exactly, rule, validate
-from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.dependencies import ESTIMABLE, contradiction
 from stewart_drake.scenario.field_types import (
     MOST_PERIODS,
@@ -45,7 +44,7 @@ from stewart_drake.scenario.link_config import (
 )
 from stewart_drake.scenario.reference_config import ReferenceConfig, SineConfig
 from stewart_drake.scenario.signals import DEFAULT_BALL_JOINT_SPEED, DEFAULT_COULOMB_SPEED, SHAFTS
-from stewart_drake.scenario.timing import METRIC_PERIOD, log_problem, step_problem
+from stewart_drake.scenario.timing import METRIC_PERIOD, Delay, log_problem, step_problem
 
 _Friction = Annotated[float, Field(ge=0, le=1e3)]
 _Wrench = Annotated[list[Annotated[float, Field(ge=-1e9, le=1e9)]], exactly(6)]

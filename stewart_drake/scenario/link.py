@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stewart_drake.scenario.config import DelayConfig, Scenario
-from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.link_config import ASSUMED_TIMES, PacketsConfig
 from stewart_drake.scenario.packets import BACK, SENSOR, packet_times, times_under_way
+from stewart_drake.scenario.timing import Delay
 from stewart_drake.types import Array, Flags
 
 SIMULTANEOUS: Final = 1e-9

@@ -2,6 +2,8 @@
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
+from numbers import Integral, Real
 from typing import Final, NamedTuple
 
 METRIC_PERIOD: Final = 0.02
@@ -163,3 +165,41 @@ def _nearest_step(step: float, period: float) -> float:
 def _is_whole(ratio: float) -> bool:
     # Relative, so that a ratio that rounds to zero counts only if it is zero.
     return abs(ratio - round(ratio)) <= 1e-9 * abs(ratio)
+
+
+@dataclass(frozen=True)
+class Delay:
+    """A delay eta = (steps + fraction) dt of a loop that is sampled every dt."""
+
+    steps: int  # mu, whole periods
+    fraction: float = 0.0  # eta0 / dt, further part of a period, in [0, 1)
+
+    def __post_init__(self) -> None:
+        numbers = isinstance(self.steps, Integral) and isinstance(self.fraction, Real)
+        if not (numbers and self.steps >= 0 and 0 <= self.fraction < 1):
+            raise ValueError(
+                f"delay: got {self.steps!r} steps and a fraction of {self.fraction!r}; expected "
+                "whole steps >= 0 and 0 <= fraction < 1"
+            )
+
+    @classmethod
+    def of(cls, eta: float, period: float) -> "Delay":
+        """Return a delay of eta s; less than LEAST_FRACTION beyond a whole period is none."""
+        periods = max(0.0, eta / period)
+        steps = int(periods + LEAST_FRACTION)
+        fraction = periods - steps
+        return cls(steps, fraction if fraction > LEAST_FRACTION else 0.0)
+
+    @property
+    def periods(self) -> float:
+        """The whole delay in periods."""
+        return self.steps + self.fraction
+
+    def eta(self, period: float) -> float:
+        """Return the whole delay in s, for a period in s."""
+        return self.periods * period
+
+    @property
+    def queue_length(self) -> int:
+        """Number of earlier torques in flight or at the plant: mu, one more for eta0 > 0."""
+        return self.steps + (1 if self.fraction > 0 else 0)

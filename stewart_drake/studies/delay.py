@@ -30,10 +30,10 @@ from stewart_drake.mechanism.assembly import torque_map
 from stewart_drake.mechanism.trajectories import evaluate
 from stewart_drake.scenario.calibration import believed_delay
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.reference_config import ReferenceConfig
 from stewart_drake.scenario.reference_files import waypoints
 from stewart_drake.scenario.signals import POSE
+from stewart_drake.scenario.timing import Delay
 from stewart_drake.studies.jobs import Progress
 from stewart_drake.studies.runs import run_scenarios
 from stewart_drake.studies.study_options import DelayOptions

@@ -92,7 +92,7 @@ def geometry(mechanism: Legs, motion: Motion) -> dict[str, float]:
         "reach": least_reach(mechanism, motion),
         "transmission": float(np.abs(legs.transmission).min()),
         "condition": condition,
-        "clearance": float(clearances(mechanism, motion.poses, legs).min()),
+        "clearance": float(clearances(mechanism, motion.poses).min()),
         "plate_joint_deg": float(np.rad2deg(turns.max())),
         "crank_joint_deg": float(np.rad2deg(np.abs(np.arcsin(np.clip(lean, -1, 1))).max())),
         "parallel": float((np.sign(parallel[0]) * parallel).min()),

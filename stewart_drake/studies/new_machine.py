@@ -33,9 +33,9 @@ from stewart_drake.mechanism.files import PatternSpec, load_mechanism, pattern_l
 from stewart_drake.mechanism.geometry import Mechanism, plate_radius
 from stewart_drake.mechanism.kinematics import leg_geometry, reachable_heights
 from stewart_drake.mechanism.trajectories import poses_along
-from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.signals import COORDINATES
+from stewart_drake.scenario.timing import Delay
 from stewart_drake.studies.clearance import clearance_along
 from stewart_drake.studies.study_options import Measurements
 from stewart_drake.studies.verdict import Verdict, loop_verdict, milliseconds

@@ -20,10 +20,9 @@ from stewart_drake.law.startup import reference_torque
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.reference_config import SineConfig
-from stewart_drake.scenario.timing import METRIC_PERIOD
+from stewart_drake.scenario.timing import METRIC_PERIOD, Delay
 from stewart_drake.studies.uncertainty import (
     Draw,
     Model,

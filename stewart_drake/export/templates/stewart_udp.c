@@ -411,7 +411,7 @@ static const real *newest_row(const controller *c, const real *memory)
     const stewart_packets *p = LAW->packets;
     return stewart_newest_packet(p, memory + LAW->layout.channel.at) + p->repeats * STEWART_MOTORS;
 {% elif servos %}
-    return memory + c->law.layout.command.at;
+    return memory + LAW->layout.command.at;
 {% else %}
     const stewart_field *in_flight = &LAW->layout.in_flight;
     return memory + in_flight->at + (in_flight->rows - 1) * STEWART_MOTORS;
