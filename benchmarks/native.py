@@ -13,10 +13,10 @@ from pydrake.math import DiscreteAlgebraicRiccatiEquation
 
 import stewart_drake as sd
 from stewart_drake.export.recording import record
-from stewart_drake.law.delay_model import chain, delayed_model, linear_model
+from stewart_drake.law.delay_model import delayed_model, linear_model
 from stewart_drake.law.motion import Preview
 from stewart_drake.law.predictive_lqi import PredictiveLqi
-from stewart_drake.law.riccati import lqr
+from stewart_drake.law.riccati import lqr, lqr_by_doubling, reduced_gain
 from stewart_drake.law.sensing import Measurement
 
 MECHANISM = sd.load_mechanism("paper")
@@ -58,15 +58,19 @@ def riccati_times(fraction: float) -> tuple[int, float, float]:
     """Return the number of states, and times in s of Drake's solver and of doubling, in turns."""
     dynamics = sd.StewartDynamics(MECHANISM)
     model = delayed_model(
-        linear_model(*dynamics.linearize(MECHANISM.home)), 0.1, 0, fraction, integral=True
+        linear_model(*dynamics.linearize(MECHANISM.home)), 0.1, 8, fraction, integral=True
     )
-    free = chain(model)
-    weighted = free.A, free.B, 1e4 * free.C.T @ free.C, np.eye(6)
-    given = [np.asfortranarray(matrix) for matrix in weighted]
+    given: list[Any] = []
+
+    def keep(*matrices: Any) -> Any:
+        given[:] = [np.asfortranarray(matrix) for matrix in matrices]
+        return lqr(*matrices)
+
+    reduced_gain(model, 1e4 * np.eye(12), np.eye(6), keep)
     times = []
     for _ in range(60):
         one = repeated(lambda: DiscreteAlgebraicRiccatiEquation(*given), 3)
-        times.append((one, repeated(lambda: lqr(*weighted), 3)))
+        times.append((one, repeated(lambda: lqr_by_doubling(*given), 3)))
     drake, ours = np.min(times, axis=0)
     return len(given[0]), float(drake), float(ours)
 

@@ -6,6 +6,7 @@ interleaved repeats.
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from _bench import section, table, write
@@ -20,7 +21,7 @@ from stewart_drake.law.delay_model import (
     delayed_model,
     double_integrators,
 )
-from stewart_drake.law.riccati import prediction_matrix, reduced_gain
+from stewart_drake.law.riccati import full_gain, prediction_matrix, reduced_gain
 from stewart_drake.mechanism.assembly import torque_map
 from stewart_drake.types import Array
 
@@ -54,10 +55,11 @@ def least_ms(calls: Sequence[Callable[[], object]], budget: float) -> list[float
     return [1e3 * seconds for seconds in least]
 
 
-def by_drake(A: Array, B: Array, Q: Array, R: Array) -> Array:
-    """Return the solution of Drake's solver, without checks of its arguments and its result."""
-    solution: Array = DiscreteAlgebraicRiccatiEquation(*map(np.asfortranarray, (A, B, Q, R)))
-    return solution
+def drake_only(system: LinearModel) -> Callable[[], Array]:
+    """Return a call of Drake's solver, without checks of its arguments and its result."""
+    matrices = (system.A, system.B, system.C.T @ Q @ system.C, R)
+    A, B, Q_x, R_x = (np.asfortranarray(matrix) for matrix in matrices)
+    return lambda: DiscreteAlgebraicRiccatiEquation(A, B, Q_x, R_x)
 
 
 def gain(system: LinearModel, P: Array) -> Array:
@@ -71,7 +73,7 @@ def difference(K: Array, expected: Array) -> float:
 
 
 def comparison(fraction: float) -> tuple[list[str], list[list[str]]]:
-    """Return rows of the gain of the whole chain, by Drake and scipy, and of the reduced one."""
+    """Return rows of the gain of the whole chain, checked and by scipy, and of the reduced one."""
     header = ["mu", "states", "full, ms", "scipy, ms", "reduced, ms", "full / reduced",
               "gains differ by", "scipy's by"]  # fmt: skip
     rows = []
@@ -80,7 +82,7 @@ def comparison(fraction: float) -> tuple[list[str], list[list[str]]]:
         system = chain(delayed)
         weight = system.C.T @ Q @ system.C
         calls: list[Callable[[], Array]] = [
-            lambda s=system, w=weight: gain(s, by_drake(s.A, s.B, w, R)),
+            lambda delayed=delayed: full_gain(delayed, Q, R)[0],
             lambda s=system, w=weight: gain(s, solve_discrete_are(s.A, s.B, w, R)),
             lambda delayed=delayed: reduced_gain(delayed, Q, R) @ prediction_matrix(delayed),
         ]
@@ -93,9 +95,18 @@ def comparison(fraction: float) -> tuple[list[str], list[list[str]]]:
     return header, rows
 
 
+def checks(fraction: float) -> list[str]:
+    """Return the time of the checks in `reduced_gain`, compared with Drake's solver."""
+    delayed = replace(model(8, fraction), steps=0)
+    bare, checked = least_ms([drake_only(chain(delayed)), lambda: reduced_gain(delayed, Q, R)], 2.0)
+    return [f"{fraction:g}", f"{bare:.3g}", f"{checked:.3g}", f"{checked / bare:.3g}"]
+
+
 def main() -> None:
     parts = [section(f"eta0 = {f:g} dt", table(*comparison(f), "---:")) for f in FRACTIONS]
-    write(__file__, "The delay reduction", parts)
+    header = ["eta0 / dt", "Drake's solver, ms", "reduced_gain, ms", "ratio"]
+    cost = table(header, [checks(f) for f in FRACTIONS], "---:")
+    write(__file__, "The delay reduction", [*parts, section("Cost of the checks", cost)])
 
 
 if __name__ == "__main__":

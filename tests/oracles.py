@@ -22,11 +22,10 @@ Nothing of the closed-form equations is used: only the SDFormat file is common t
 
 import re
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.math import DiscreteAlgebraicRiccatiEquation, RollPitchYaw
+from pydrake.math import RollPitchYaw
 from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
@@ -40,8 +39,7 @@ from pydrake.multibody.tree import (
 from scipy.integrate import solve_ivp
 
 from stewart_drake.dynamics.stewart import plant_parameters
-from stewart_drake.law.delay_model import chain
-from stewart_drake.law.riccati import RiccatiError, prediction_matrix, reduced_gain
+from stewart_drake.law.riccati import prediction_matrix, reduced_gain
 from stewart_drake.mechanism.clearance import LINK_PAIRS, link_radii
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import UnreachablePoseError, dot, leg_geometry, legs_along
@@ -270,31 +268,6 @@ def off_dead_centre(mechanism: Mechanism, pose: Array) -> float:
 def augmented_gain(model, Q, R):
     """Return K_aug (m, n + m L) = K [A^mu, A^(mu-1) B, ..., B]."""
     return reduced_gain(model, Q, R) @ prediction_matrix(model)
-
-
-def lqr_by_drake(A, B, Q, R):
-    """Return K and P as `law.riccati.lqr`, for any numbers of states and torques."""
-    symmetric = (Q + Q.T) / 2, (R + R.T) / 2
-    P = DiscreteAlgebraicRiccatiEquation(*map(np.asfortranarray, (A, B, *symmetric)))
-    K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
-    closed = A - B @ K
-    residual, size = np.linalg.norm(Q + A.T @ P @ closed - P), np.linalg.norm(P)
-    if not (residual <= 1e-4 * size and np.abs(np.linalg.eigvals(closed)).max() < 1):
-        raise RiccatiError("Drake's solver did not solve it")
-    return K, P
-
-
-def augmented_gain_by_drake(model, Q, R):
-    """Return `augmented_gain` for any numbers of states and torques."""
-    free = chain(replace(model, steps=0))
-    K, _ = lqr_by_drake(free.A, free.B, free.C.T @ Q @ free.C, R)
-    return K @ prediction_matrix(model)
-
-
-def full_gain(model, Q, R):
-    """Return (42)-(44) on the whole chain (37)-(39): K (m, n + m L) and P, with Q on y = C e."""
-    augmented = chain(model)
-    return lqr_by_drake(augmented.A, augmented.B, augmented.C.T @ Q @ augmented.C, R)
 
 
 def relative(value: Array, expected: Array) -> float:

@@ -23,7 +23,7 @@ from stewart_drake.law.memory import Memory
 from stewart_drake.law.motion import Preview
 from stewart_drake.law.nominal import MultibodyModel, TorqueLimit
 from stewart_drake.law.predictors import LinearPredictor, NonlinearPredictor
-from stewart_drake.law.riccati import RiccatiError
+from stewart_drake.law.riccati import RiccatiError, full_gain
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.startup import weight_scales
 from stewart_drake.law.timeline import Timeline
@@ -35,7 +35,7 @@ from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.timing import Delay
 from tests.backends import Predicted
 from tests.mechanisms import PAPER
-from tests.oracles import full_gain, relative
+from tests.oracles import relative
 
 WEIGHTS = np.array([1.0, 1.0])
 HOME = np.concatenate([PAPER.home, np.zeros(12)])

@@ -33,7 +33,7 @@ from stewart_drake.mechanism.trajectories import evaluate
 from stewart_drake.studies.delay import loop_margins, simulated_growth
 from stewart_drake.studies.verdict import assess
 from tests.mechanisms import PAPER
-from tests.oracles import augmented_gain_by_drake
+from tests.oracles import augmented_gain
 
 HEAVY = sd.StewartDynamics(PAPER, gravity=True)
 
@@ -119,7 +119,7 @@ def loop(steps, fraction=0.0):
     B = np.vstack([zero, [[1.0, 0.2], [-0.4, 2.0]]])
     continuous = LinearModel(A, B, np.eye(2, 4))
     model = delayed_model(continuous, 0.2, steps, fraction, integral=True)
-    return model, augmented_gain_by_drake(model, np.eye(4), 0.1 * np.eye(2))
+    return model, augmented_gain(model, np.eye(4), 0.1 * np.eye(2))
 
 
 @pytest.mark.parametrize(("steps", "fraction"), [(0, 0.0), (3, 0.0), (0, 0.4), (2, 0.7)])
@@ -162,7 +162,7 @@ def test_margins_of_one_motor_agree_with_python_control(steps):
     """A double integrator: eigenvalues against its transfer function's crossings."""
     continuous = LinearModel(np.eye(2, k=1), np.array([[0.0], [1.0]]), np.eye(1, 2))
     model = delayed_model(continuous, 0.1, steps, 0.0, integral=False)
-    K = augmented_gain_by_drake(model, np.eye(1), np.eye(1))
+    K = augmented_gain(model, np.eye(1), np.eye(1))
     P = control.ss(model.A, model.B_new, K[:, :2], 0, 0.1)
     memory = np.concatenate([[1.0], K[0, 2:][::-1]])  # 1 + sum K_i z^-i
     lag = control.tf([1.0], [1.0] + steps * [0.0], 0.1)
@@ -251,7 +251,7 @@ def test_weights_that_hardly_act_keep_the_faithful_controllers_stable(controller
             linear_model(*sd.StewartDynamics(PAPER, gravity=False).linearize(PAPER.home)),
         )
     ]
-    K = augmented_gain_by_drake(models[0], weight * np.eye(12 if integral else 6), np.eye(6))
+    K = augmented_gain(models[0], weight * np.eye(12 if integral else 6), np.eye(6))
     true = chain(models[1])
     found = np.abs(np.linalg.eigvals(true.A - true.B @ K)).max()
     assert found == pytest.approx(radius, abs=1e-3)

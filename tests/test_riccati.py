@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.law import riccati
 from stewart_drake.law.delay_model import (
     DelayedModel,
     chain,
@@ -14,11 +15,11 @@ from stewart_drake.law.delay_model import (
     double_integrators,
     linear_model,
 )
-from stewart_drake.law.riccati import RiccatiError, reduced_gain
+from stewart_drake.law.riccati import RiccatiError, full_gain, lqr, reduced_gain
 from stewart_drake.law.stability import is_stable
 from stewart_drake.mechanism.assembly import torque_map
 from tests.mechanisms import PAPER
-from tests.oracles import augmented_gain, full_gain, lqr_by_drake, relative
+from tests.oracles import augmented_gain, relative
 
 Extended = NDArray[np.longdouble]
 
@@ -58,7 +59,7 @@ def undelayed_solution(model, Q, R):
     short = chain(DelayedModel(model.A, model.B_old, model.B_new, model.C, 0, model.fraction))
     A, B, C, R_ = (np.asarray(x, np.longdouble) for x in (short.A, short.B, short.C, R))
     Q_ = C.T @ np.asarray(Q, np.longdouble) @ C
-    P = np.asarray(lqr_by_drake(short.A, short.B, short.C.T @ Q @ short.C, R)[1], np.longdouble)
+    P = np.asarray(lqr(short.A, short.B, short.C.T @ Q @ short.C, R)[1], np.longdouble)
     for _ in range(10_000):
         after = Q_ + A.T @ P @ (A - B @ riccati_gain(P, A, B, R_))
         after = (after + after.T) / 2
@@ -167,11 +168,10 @@ def test_gain_of_one_delayed_state_is_in_closed_form(a, b, q, r, steps):
     half = (r - a**2 * r - q * b**2) / 2
     p = (-half + np.sqrt(half**2 + b**2 * q * r)) / b**2
     k = a * b * p / (r + b**2 * p)
-    one = np.eye(6)  # of each of six that do not act on each other
+    one = np.ones((1, 1))
     model = DelayedModel(a * one, 0 * one, b * one, one, steps, 0.0)
-    gains = [k * a**steps, *(k * b * a**j for j in reversed(range(steps)))]
-    expected = np.hstack([gain * one for gain in gains])
-    assert reduced_gain(model, q * one, r * one) == pytest.approx(k * one, rel=1e-7, abs=1e-12)
+    expected = [[k * a**steps, *(k * b * a**j for j in reversed(range(steps)))]]
+    assert reduced_gain(model, q * one, r * one) == pytest.approx(k, rel=1e-7, abs=1e-12)
     assert np.allclose(augmented_gain(model, q * one, r * one), expected, rtol=1e-7, atol=1e-10)
     assert np.allclose(full_gain(model, q * one, r * one)[0], expected, rtol=1e-5, atol=1e-8)
 
@@ -192,25 +192,82 @@ def test_gain_depends_on_the_ratio_of_the_weights_only(name, integral, fraction,
     assert relative(augmented_gain(model, 2 * ratio * Q, R), once) > 1e-4
 
 
+# Bad input. `lqr` raises RiccatiError, which pytest.raises tells from SystemExit; a shape that does
+# not fit is a mistake in a program and a plain ValueError.
+
+A, B, Q, R = np.array([[1.0, 0.1], [0, 1]]), np.array([[0.0], [0.1]]), np.eye(2), np.eye(1)
+NAN, INF = np.nan, np.inf
+ONE_INPUT = np.array([[1.0], [1]])
+TURNING = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 0.5]])
+"""A mode on the unit circle that goes round in four steps, and a stable one."""
+
+BAD = {
+    "A not square": ("A", (np.ones((2, 3)), B, Q, R)),
+    "A a vector": ("A", (np.ones(2), B, Q, R)),
+    "A a number": ("A", (np.array(1.0), B, Q, R)),
+    "nothing": ("A", (np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((0, 0)), R)),
+    "no input": ("B", (A, np.zeros((2, 0)), Q, np.zeros((0, 0)))),
+    "B too long": ("A|B", (A, np.ones((3, 1)), Q, R)),
+    "B a vector": ("B", (A, np.ones(2), Q, R)),
+    "B a stack": ("B", (A, np.ones((2, 1, 1)), Q, R)),
+    "Q too large": ("Q", (A, B, np.eye(3), R)),
+    "R too large": ("R", (A, B, Q, np.eye(2))),
+    "NaN in A": ("A", (A * NAN, B, Q, R)),
+    "infinite B": ("B", (A, np.array([[0.0], [INF]]), Q, R)),
+    "NaN in Q": ("Q", (A, B, np.diag([1.0, NAN]), R)),
+    "infinite Q": ("Q", (A, B, np.diag([1.0, INF]), R)),
+    "NaN in R": ("R", (A, B, Q, NAN * R)),
+    "R zero": ("R", (A, B, Q, 0 * R)),
+    "R negative": ("R", (A, B, Q, -R)),
+    "R indefinite": ("R", (A, np.eye(2), Q, np.diag([1.0, -1]))),
+    "R singular": ("R", (A, np.eye(2), Q, np.diag([1.0, 0]))),
+    "R asymmetric": ("R", (A, np.eye(2), Q, np.array([[1.0, 0.5], [0, 1]]))),
+    "Q negative": ("Q", (A, B, -Q, R)),
+    "Q indefinite": ("Q", (A, B, np.diag([1.0, -1e-3]), R)),
+    "Q asymmetric": ("Q", (A, B, np.array([[1.0, 0.5], [0, 1]]), R)),
+    "no way to an unstable mode": ("(A, B)", (np.diag([2.0, 0.5]), np.eye(2)[:, 1:], Q, R)),
+    "no way to a mode at one": ("(A, B)", (np.diag([1.0, 0.5]), np.eye(2)[:, 1:], Q, R)),
+    "no torque at all": ("(A, B)", (A, 0 * B, Q, R)),
+    "a mode at one unseen": ("(A, Q)", (np.diag([1.0, 0.5]), ONE_INPUT, np.diag([0.0, 1]), R)),
+    "an unstable mode unseen": ("(A, Q)", (np.diag([2.0, 0.5]), ONE_INPUT, np.diag([0.0, 1]), R)),
+    "a turning mode unseen": ("(A, Q)", (TURNING, np.ones((3, 1)), np.diag([0.0, 0, 1]), R)),
+    "poses unseen": ("(A, Q)", (A, B, np.diag([0.0, 1]), R)),
+    "Q zero": ("(A, Q)", (A, B, 0 * Q, R)),
+}
+
+
+SHAPES = {
+    *("A not square", "A a vector", "A a number", "nothing", "no input"),
+    *("B too long", "B a vector", "B a stack", "Q too large", "R too large"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_gives_an_error_of_its_kind_that_names_the_matrix(case):
+    name, arguments = BAD[case]
+    assert not issubclass(RiccatiError, ValueError)
+    with pytest.raises(ValueError if case in SHAPES else RiccatiError) as caught:
+        lqr(*arguments)
+    named = str(caught.value).partition(": ")[0]
+    assert named in name.split("|")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("solve", [full_gain, reduced_gain, augmented_gain])
 @pytest.mark.parametrize(
     ("Q", "R", "error"),
     [
+        (1e12 * np.eye(12), 1e-12 * np.eye(6), RiccatiError),
         (np.eye(12), 0 * np.eye(6), RiccatiError),
+        (np.diag([0.0] + [1.0] * 5 + [0.0] + [1.0] * 5), np.eye(6), RiccatiError),  # roll unseen
         (np.eye(12), np.eye(5), ValueError),
         (np.eye(11), np.eye(6), ValueError),
     ],
 )
 @pytest.mark.parametrize("name", PLATFORMS)
-def test_every_gain_of_the_platform_refuses_bad_weights(name, Q, R, error):
+def test_every_gain_of_the_platform_refuses_bad_weights(name, Q, R, error, solve):
     with pytest.raises(error):
-        reduced_gain(delayed(name, 2, 0.0), Q, R)
-
-
-def test_a_mode_that_the_cost_does_not_see_has_no_gain():
-    """Roll, which gravity lets fall."""
-    Q = np.diag(2 * [0.0, 1, 1, 1, 1, 1])
-    with pytest.raises(RiccatiError, match="no stabilising gain"):
-        reduced_gain(delayed("gravity", 2, 0.0), Q, np.eye(6))
+        solve(delayed(name, 2, 0.0), Q, R)
 
 
 def test_a_motor_that_cannot_move_the_plate_is_found_out():
@@ -240,6 +297,25 @@ def test_whatever_the_weights_a_gain_that_comes_out_stabilises(data, w_Q, w_R, n
         return
     augmented = chain(model)
     assert spectral_radius(augmented.A - augmented.B @ K) < 1 + 1e-9
+
+
+def test_a_solver_that_answers_nonsense_or_ends_the_process_is_caught(monkeypatch):
+    def ends(*_):
+        raise SystemExit("condition failed")
+
+    def gives_up(*_):
+        raise RuntimeError("no solution")
+
+    answers = {
+        "condition failed": ends,
+        "no solution": gives_up,
+        "NaN": lambda *_: np.full((2, 2), np.nan),
+        "did not solve": lambda *_: np.eye(2),
+    }
+    for message, answer in answers.items():
+        monkeypatch.setattr(riccati, "DiscreteAlgebraicRiccatiEquation", answer)
+        with pytest.raises(RiccatiError, match=message):
+            lqr(A, B, Q, R)
 
 
 @given(

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from stewart_drake.dynamics.stewart import StewartDynamics
-from stewart_drake.law.riccati import reduced_gain
+from stewart_drake.law.riccati import full_gain
 from stewart_drake.law.startup import machine_torque
 from stewart_drake.loop import preparation as experiment_module
 from stewart_drake.loop.simulation import simulate
@@ -139,7 +139,7 @@ def test_a_file_may_describe_a_machine_of_a_few_millimetres(tmp_path):
 def test_units_change_no_gain(name, steps, fraction):
     """Metres or millimetres, N m or mN m: the gain in one unit follows from that in the other."""
     model, (Q, R) = delayed(name, steps, fraction), UNIT
-    K = reduced_gain(model, Q, R)
+    K, P = full_gain(model, Q, R)
     x, y = np.tile(np.repeat([1.0, 1e3], 3), 3), np.tile(np.repeat([1.0, 1e3], 3), 2)
     u = 1e6
     other = dataclasses.replace(
@@ -149,6 +149,7 @@ def test_units_change_no_gain(name, steps, fraction):
         B_new=model.B_new * x[:, None] / u,
         C=model.C * y[:, None] / x,
     )
-    found = reduced_gain(other, Q / np.outer(y, y), R / u**2)
-    states = np.concatenate([x, np.full(6 if fraction else 0, u)])
-    assert relative(found * states / u, K) < 1e-12
+    found, cost = full_gain(other, Q / np.outer(y, y), R / u**2)
+    chain = np.concatenate([x, np.full(6 * model.queue_length, u)])
+    assert relative(found * chain / u, K) < 1e-8
+    assert relative(cost * np.outer(chain, chain), P) < 1e-8

@@ -24,7 +24,7 @@
 #else
 #define VANISHED 1e-9
 #define NOTED_RESIDUAL 1e-13 /* above rounding; needed in one of some hundred badly scaled designs */
-#define LARGEST_RESIDUAL 1e-4
+#define LARGEST_RESIDUAL 1e-4 /* as in law/riccati.py, relative to the solution */
 #endif
 
 /* Number of columns of rows i and i + 1 up to the diagonal, in whole blocks; i is even. */

@@ -47,7 +47,7 @@ from stewart_drake.law.memory import Memory
 from stewart_drake.law.motion import Motion, Preview
 from stewart_drake.law.nominal import NominalPlant, TorqueLimit
 from stewart_drake.law.predictive_lqi import OuterLqi, OuterMemory
-from stewart_drake.law.riccati import lqr
+from stewart_drake.law.riccati import lqr_by_doubling
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.mechanism.kinematics import reach_margins
@@ -316,7 +316,7 @@ class LimitedLqi(OuterLqi):
         errors[POSE] = np.diag(Q)[:NUM_COORDINATES]
         ends = np.tile(ahead.states(self.limits.space)[-1], (2, 1))
         last = holds.linearised(ends, ahead.torques[-1:])
-        _, P = lqr(last.Phi[0], last.Gamma[0], np.diag(errors), TERMINAL_R * R)
+        _, P = lqr_by_doubling(last.Phi[0], last.Gamma[0], np.diag(errors), TERMINAL_R * R)
         torques = ahead.torques
         if self.cost.integrates and np.isfinite(after.gain).all():
             size = NUM_STATE + NUM_COORDINATES

@@ -34,6 +34,7 @@ from stewart_drake.law.delay_model import (
     linear_model,
     with_integral,
 )
+from stewart_drake.law.riccati import pbh_margins, pencils
 from stewart_drake.mechanism.assembly import torque_map
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.signals import COORDINATE_NAMES, NUM_TORQUES
@@ -110,7 +111,7 @@ def hautus(A: ArrayLike, B: ArrayLike, *, discrete: bool) -> Hautus:
             continue  # its conjugate represents both
         # The pencil has full rank except at eigenvalues, so an additional point cannot fail.
         points = np.unique(np.append(members, center))
-        margins = least_singular_values(A, B, points) / size
+        margins = pbh_margins(A, B, points) / size
         failing = margins < TOLERANCE
         if not failing.any():
             found = [(center, float(margins.min()))]
@@ -118,7 +119,7 @@ def hautus(A: ArrayLike, B: ArrayLike, *, discrete: bool) -> Hautus:
             found = [(center, float(margins[points == center][0]))]
         else:
             groups = cluster(points[failing], _SAME * radius)
-            least = [group[least_singular_values(A, B, group).argmin()] for group in groups]
+            least = [group[pbh_margins(A, B, group).argmin()] for group in groups]
             found = [(complex(at), float(margins[points == at][0])) for at in least]
         for value, margin in found:
             decays = abs(value) < 1 - BOUNDARY if discrete else value.real < -BOUNDARY * radius
@@ -156,20 +157,6 @@ def cluster(values: Complex, distance: float) -> list[Complex]:
     points = np.column_stack([values.real, values.imag])
     groups = fclusterdata(points, distance, "distance", method="single")
     return [values[groups == group] for group in np.unique(groups)]
-
-
-def pencils(A: Array, B: Array, points: NDArray[np.inexact]) -> NDArray[np.inexact]:
-    """Return [lambda I - A, B] (k, n, n + m) for points lambda (k,)."""
-    shifted = points[:, None, None] * np.eye(len(A)) - A
-    return np.concatenate([shifted, np.broadcast_to(B, (len(points), *B.shape))], axis=2)
-
-
-def least_singular_values(A: Array, B: Array, points: Complex) -> Array:
-    """Return that of the pencil at each point (k,)."""
-    real = np.all(np.abs(points.imag) <= 1e-12 * np.abs(points))
-    # Real arithmetic takes half the time.
-    at = points.real if real else points
-    return np.linalg.svd(pencils(A, B, at), compute_uv=False)[:, -1]
 
 
 # ---------------------------------------------------------------- the models
