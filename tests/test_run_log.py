@@ -157,6 +157,7 @@ def test_a_log_is_replayed(run, tmp_path):
         ("log.csv", b"a,b\n1,2\n", "column 'a'"),
         ("log.csv", b"", "cannot be read"),
         ("log.csv", b"\xff\xfe\n", "cannot be read"),
+        ("log.csv", b'"' + 200_000 * b"1", "field larger than field limit"),
         ("log.txt", b"", "file of another kind"),
         ("log.nc", b"CDF", "cannot be read"),
     ],

@@ -13,6 +13,7 @@ import numpy as np
 
 from stewart_drake.dynamics.native_functions import one_blas_thread
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.live.checks import check_whole_motion
 from stewart_drake.live.contact import Contact, await_free, call, open_endpoint, parse_address
 from stewart_drake.live.design import (
     Design,
@@ -263,11 +264,12 @@ def drive(
         pace: pole of the governor, 1/s; by default it depends on the torque limit.
 
     Raises:
-        ConfigError: not armed for a real machine, too much jitter, or a machine that does not
-            begin.
+        ConfigError: not armed for a real machine, too much jitter, a motion out of reach, or a
+            machine that does not begin.
     """
     check_armed(ready, armed)
     check_jitter(ready, accept_jitter)
+    check_whole_motion(ready.design.experiment, duration)
     made, contact = ready.design, ready.contact
     # Holds of a period follow no faster one.
     fastest, slowest = min(FASTEST, 1 / made.law.timeline.period), PACE

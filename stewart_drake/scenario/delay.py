@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from numbers import Integral, Real
 
+from stewart_drake.files.errors import ConfigError
 from stewart_drake.scenario.timing import LEAST_FRACTION
 
 
@@ -16,9 +17,9 @@ class Delay:
     def __post_init__(self) -> None:
         numbers = isinstance(self.steps, Integral) and isinstance(self.fraction, Real)
         if not (numbers and self.steps >= 0 and 0 <= self.fraction < 1):
-            raise ValueError(
+            raise ConfigError(
                 f"delay: got {self.steps!r} steps and a fraction of {self.fraction!r}; expected "
-                "whole steps >= 0 and 0 <= fraction < 1"
+                "whole steps of at least 0, and a fraction of a step from 0 to below 1"
             )
 
     @classmethod

@@ -348,7 +348,7 @@ def read_log(path: str | Path) -> xr.Dataset:
         raise ConfigError(f"{path}: got a file of another kind; expected {EXPECTED}")
     try:
         return _read_csv(path) if path.suffix == ".csv" else _read_mcap(path)
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, csv.Error) as error:
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         raise ConfigError(f"{path}: cannot be read ({reason}); expected {EXPECTED}") from None
 
