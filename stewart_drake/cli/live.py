@@ -125,7 +125,7 @@ def live(
     if options.log is not None:
         show = command_line("replay", str(options.log))
         delivery.say(f"log written to {options.log}: {show}")
-    return _delivered(delivery, result, LOG)
+    return _delivered(delivery, result, LOG, "log.yaml")
 
 
 def _in_real_time(chosen: Chosen) -> "Scenario":
