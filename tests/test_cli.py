@@ -163,6 +163,28 @@ def test_ctrl_c_in_report_writes_nothing(tmp_path):
     assert not files(tmp_path)
 
 
+def test_ctrl_c_that_a_command_does_not_report_is_reported(monkeypatch, capsys):
+    def interrupted(kind):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("stewart_drake.reporting.terminal.shipped_table", interrupted)
+    assert main(["list"]) == 130
+    assert capsys.readouterr().err == f"{STOPPED}\n"
+
+
+def test_after_the_command_a_signal_ends_the_process_without_a_traceback():
+    code = """
+import signal, sys
+from stewart_drake.__main__ import run
+
+sys.argv[1:] = ["--version"]
+run()
+assert signal.getsignal(signal.SIGINT) == signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_ctrl_c_while_drake_is_loaded_is_one_as_well(monkeypatch):
     """A C++ module whose loading is interrupted says so by an ImportError."""
     stop = KeyboardInterrupt()

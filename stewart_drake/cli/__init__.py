@@ -91,7 +91,17 @@ def _without_value(words: list[str]) -> str | None:
 @functools.cache
 def _command() -> Any:
     add_examples(app)
-    return typer.main.get_command(app)
+    command: Any = typer.main.get_command(app)
+    invoke = command.invoke
+
+    def noticing(context: Any) -> Any:
+        try:
+            return invoke(context)
+        except KeyboardInterrupt:  # typer would return as after a command that says so itself
+            raise typer.Abort from None
+
+    command.invoke = noticing
+    return command
 
 
 def _prepare_surroundings() -> None:
