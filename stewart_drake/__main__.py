@@ -19,6 +19,9 @@ def run() -> int:
     if signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:
         signal.signal(signal.SIGTERM, interrupt)
     status = main()
+    for number in (signal.SIGINT, signal.SIGTERM):  # at exit nothing catches an exception
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, signal.SIG_DFL)
     return TERMINATED if status == INTERRUPTED and signal.SIGTERM in SIGNALS else status
 
 

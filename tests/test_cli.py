@@ -149,6 +149,9 @@ def test_ctrl_c_in_simulate_keeps_what_was_computed(tmp_path, number, status):
         assert np.isfinite(signals.pose.values).all()
 
 
+STOPPED = "stopped before the end; files that were written are kept"
+
+
 @pytest.mark.slow
 def test_ctrl_c_in_report_writes_nothing(tmp_path):
     code = (
@@ -156,8 +159,30 @@ def test_ctrl_c_in_report_writes_nothing(tmp_path):
         "print('ready', flush=True); sys.exit(main(sys.argv[1:]))"
     )
     arguments = ["report", *EXACT, "--set", "duration=2.0", "--out", str(tmp_path)]
-    assert interrupted(arguments, wait=2.0, group=True, code=code)[0] == 130
+    assert interrupted(arguments, wait=2.0, group=True, code=code) == (130, STOPPED)
     assert not files(tmp_path)
+
+
+def test_ctrl_c_that_a_command_does_not_report_is_reported(monkeypatch, capsys):
+    def interrupted(kind):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("stewart_drake.reporting.terminal.shipped_table", interrupted)
+    assert main(["list"]) == 130
+    assert capsys.readouterr().err == f"{STOPPED}\n"
+
+
+def test_after_the_command_a_signal_ends_the_process_without_a_traceback():
+    code = """
+import signal, sys
+from stewart_drake.__main__ import run
+
+sys.argv[1:] = ["--version"]
+run()
+assert signal.getsignal(signal.SIGINT) == signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_ctrl_c_while_drake_is_loaded_is_one_as_well(monkeypatch):

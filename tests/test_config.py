@@ -254,6 +254,7 @@ REFUSED = [
     ("controller.delay_steps=80ms", "got '80ms'; expected a whole number of periods, from 0 to"),
     ("reference.frequency=1Hz", "got '1Hz'; expected a number above 0 and of at most 1e4, or six"),
     ("controller.period=100", "controller.period: got 100; expected at most 10 s; 20 ms is 0.02"),
+    ("actuator.torque_limit=6Nm", "got '6Nm'; expected a number above 0 and of at most 1e6 N m"),
     ("plant.payload_mass=20 g", "plant.payload_mass: got '20 g'; expected a number, in kg"),
     (
         "controller.kind=predictor_lqi",

@@ -35,6 +35,7 @@ from stewart_drake.law.belief import Estimate
 from stewart_drake.law.gaps import longest_gap, within_reach
 from stewart_drake.law.stability import Margins
 from stewart_drake.live import contact as contacts
+from stewart_drake.live.checks import check_whole_motion
 from stewart_drake.live.contact import Contact, Link, await_free, call, open_endpoint, parse_address
 from stewart_drake.live.design import Design, as_seen, check_controller, design
 from stewart_drake.live.endpoint import Endpoint, now
@@ -68,6 +69,7 @@ from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.reference_config import SineConfig
 from stewart_drake.scenario.signals import ACCELERATIONS, POSE, RATES
 from tests.browser import browser, needs_chromium
+from tests.faults import written
 from tests.live_driver import Together, Wire, in_real_time, running_machine, until
 
 
@@ -900,13 +902,59 @@ def test_the_demo_runs_unattended_and_shows_its_jitter(capsys, tmp_path):
     """The name of the scenario's file may be anything."""
     named = tmp_path / "machine paper at 127.0.0.1:7: x.yaml"
     named.write_text("mechanism: paper")
-    assert main(["live", str(named), "--demo", "--no-browser", "--duration", "1"]) == 0
+    log = tmp_path / "l.csv"
+    words = ["--demo", "--no-browser", "--duration", "1", "--log", str(log)]
+    assert main(["live", str(named), *words]) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert "round trips vary by" in said and "play-out buffer absorbs" in said
     assert "at 1.0 s: coming to rest, within 8 s; Ctrl-C stops at once" in said
-    assert "now the motors have no torque status completed" in said
+    shown = f"log written to {log}: stewart-drake replay {log}"
+    assert f"now the motors have no torque {shown} status completed" in said
     packets = re.search(r"packets (\d+) sent, \d+ lost, \d+ played, \d+ dry", said)
     assert packets is not None and int(packets[1]) == 10
+
+
+@pytest.mark.parametrize("words", [["live", "paper", "--demo"], ["machine"]])
+def test_the_duration_of_a_simulation_is_refused(capsys, words):
+    assert main([*words, "--set", "duration=1"]) == 2
+    said = "error: --set: duration: got '1'; expected --duration SECONDS\n"
+    assert capsys.readouterr().err == said
+
+
+MOTIONS = {
+    "out of reach": "0,0.38 1,0.39 2,0.38 3,0.38 9,0.6 12,0.6",
+    "still moving": "0,0.38 0.5,0.375 1,0.37 2,0.36",
+    "sines": "reference={amplitude: [0, 0, 0, 0, 0.07, 0.09], frequency: [1, 1, 1, 1, 0.31, 1]}",
+}
+
+
+@pytest.mark.parametrize(
+    ("motion", "seconds", "problem"),
+    [
+        ("out of reach", 2.0, None),
+        ("out of reach", 8.0, "reached the end of its reach at t = "),
+        ("still moving", 1.5, None),
+        ("still moving", 2.5, "expected samples that come to rest"),
+        ("still moving", math.inf, "expected samples that come to rest"),
+        ("sines", 10.0, None),
+        ("sines", math.inf, "reached the end of its reach at t = "),
+    ],
+)
+def test_a_motion_is_checked_up_to_the_end_of_the_run(tmp_path, motion, seconds, problem):
+    """The scenario's duration is shorter."""
+    setting = MOTIONS[motion]
+    if motion != "sines":
+        heads = "time[s],roll[rad],pitch[rad],yaw[rad],x[m],y[m],z[m]\n"
+        rows = setting.replace(",", ",0,0,0,0,0,").replace(" ", "\n")
+        path = written(tmp_path / "motion.csv", heads + rows)
+        setting = f"reference={{kind: csv, file: {path}}}"
+    experiment = prepare(scenario_of("duration=1.5", setting))
+    if problem is None:
+        check_whole_motion(experiment, seconds)
+        return
+    design = SimpleNamespace(experiment=experiment)
+    with pytest.raises(ConfigError, match=problem):
+        drive(SimpleNamespace(design=design, simulated=True, jitter_problem=None), seconds)
 
 
 def test_a_demo_that_cannot_start_says_why(capsys):

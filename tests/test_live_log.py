@@ -26,8 +26,9 @@ from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.servos import servo_law
 from stewart_drake.mechanism.trajectories import evaluate
 from stewart_drake.reporting.csv_file import signals_csv
+from stewart_drake.scenario import run_log
 from stewart_drake.scenario.loading import load_scenario
-from stewart_drake.scenario.run_log import open_log
+from stewart_drake.scenario.run_log import open_log, read_log
 from stewart_drake.scenario.signals import POSE
 from stewart_drake.studies.learn import lacking_angles
 from tests.copies import Command, status_of
@@ -194,7 +195,9 @@ def test_a_killed_run_leaves_all_but_its_last_second(tmp_path):
         ran = (running.machine.time() - began) / 1e9
     header, rows = lines_of(tmp_path / "log.csv")
     assert header[:2] == ["time[s]", "pose_roll[rad]"]
-    assert {path.name for path in tmp_path.iterdir()} == {"log.csv"}
+    assert {path.name for path in tmp_path.iterdir()} == {"log.csv", "log.yaml"}
+    kept = run_log.scenario_of(read_log(tmp_path), tmp_path)
+    assert kept.link.kind == "network" and kept.start == "rest"
     times = [float(row[0]) for row in rows]
     assert times[-1] > ran - 1.0
     assert all(b - a == pytest.approx(0.1) for a, b in pairwise(times))

@@ -98,6 +98,9 @@ LOOPS = {
     "packets between samples": scenario(
         "paper", "duration=3", *PACKETS, "link.playout=0.33", "link.dry=zero", "link.seed=6", *DIRTY
     ),
+    "packets on the reference": scenario(
+        "paper", "duration=1", *PACKETS, "link.playout=0.33", "link.dry=zero", *FOLLOWS
+    ),
     "packets one way": scenario(
         "paper", "duration=3", *PACKETS[:4], "link.acknowledged=false", *FOLLOWS, *DIRTY
     ),
@@ -250,6 +253,11 @@ def test_what_it_has_not_runs_in_drake_and_says_so(field, settings):
     assert found.loop == f"drake, {field}"
     assert_same(found, expected)
     assert np.array_equal(found.samples, expected.samples, equal_nan=True)
+
+
+def test_servos_without_their_reports_run_in_drake():
+    """The torques of a lost measurement are unknown, and with it the cost."""
+    assert uncovered(sd.load_scenario("reachy_mini", settings=["sensor.loss=0.1"])) == "sensor.loss"
 
 
 def test_where_no_step_is_short_enough_drake_tries(monkeypatch):

@@ -5,6 +5,7 @@ import os
 import socket
 import threading
 import time
+from dataclasses import replace
 from functools import partial
 from unittest.mock import Mock
 
@@ -157,6 +158,7 @@ def test_a_log_is_replayed(run, tmp_path):
         ("log.csv", b"a,b\n1,2\n", "column 'a'"),
         ("log.csv", b"", "cannot be read"),
         ("log.csv", b"\xff\xfe\n", "cannot be read"),
+        ("log.csv", b'"' + 200_000 * b"1", "field larger than field limit"),
         ("log.txt", b"", "file of another kind"),
         ("log.nc", b"CDF", "cannot be read"),
     ],
@@ -164,6 +166,18 @@ def test_a_log_is_replayed(run, tmp_path):
 def test_what_is_no_log_is_said_in_a_line(tmp_path, name, data, words):
     path = written(tmp_path / name, data)
     one_line(lambda: sd.read_log(path), words, name)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".mcap"])
+def test_two_runs_do_not_write_one_log(tmp_path, suffix):
+    path, scenario = tmp_path / f"log{suffix}", sd.load_scenario("paper")
+    first = open_log(path, scenario)
+    first.write(0.0, {"pose": np.zeros(6)})
+    one_line(lambda: open_log(path, replace(scenario, duration=3.0)), "another log", str(path))
+    first.close()
+    read = sd.read_log(path)
+    assert read.sizes["time"] == 1 and scenario_of(read, path) == scenario
+    open_log(path, scenario).close()
 
 
 def test_missing_logs_are_said_in_a_line(tmp_path):

@@ -176,7 +176,10 @@ NETWORK = load_network(resolve("weights", "tuner"))
         (lambda: DelayChain(NAN, 0, 0.0, EMPTY), "period: got nan"),
         (lambda: DelayChain("0.1", 0, 0.0, EMPTY), "period: got '0.1'"),
         (lambda: DelayChain(0.1, 1, 0.0, np.full((1, 6), NAN)), "queue: got [nan"),
-        (lambda: DelayChain(0.1, 1.5, 0.0, np.zeros((1, 6))), "delay: got 1.5 steps"),
+        (
+            lambda: DelayChain(0.1, 1.5, 0.0, np.zeros((1, 6))),
+            "delay: got 1.5 steps",
+        ),
         (lambda: DelayChain(0.1, 1, "half", np.zeros((1, 6))), "delay: got 1 steps and a fraction"),
         (lambda: DelayChain(0.1, 0, 0.0, EMPTY, "force"), "carries: got 'force'"),
         (lambda: VaryingDelay(0.0, [0.1], AT_ONCE, EMPTY), "period: got 0.0"),

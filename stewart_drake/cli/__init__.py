@@ -60,13 +60,13 @@ def main(arguments: list[str] | None = None) -> int:
     except _UsageError as error:
         return _complain(_usage_message(error, words))
     except typer.Abort:  # Ctrl-C
-        return INTERRUPTED
+        return _stopped()
     except ImportError as error:  # Drake turns Ctrl-C into nested ones while it is loaded
         cause: BaseException | None = error
         while isinstance(cause, ImportError):
             cause = cause.__cause__
         if isinstance(cause, KeyboardInterrupt):
-            return INTERRUPTED
+            return _stopped()
         raise
     except BrokenPipeError:  # the reader of the output has left
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -91,7 +91,17 @@ def _without_value(words: list[str]) -> str | None:
 @functools.cache
 def _command() -> Any:
     add_examples(app)
-    return typer.main.get_command(app)
+    command: Any = typer.main.get_command(app)
+    invoke = command.invoke
+
+    def noticing(context: Any) -> Any:
+        try:
+            return invoke(context)
+        except KeyboardInterrupt:  # typer would return as after a command that says so itself
+            raise typer.Abort from None
+
+    command.invoke = noticing
+    return command
 
 
 def _prepare_surroundings() -> None:
@@ -142,6 +152,11 @@ def _bad_input() -> tuple[type[Exception], ...]:
 def _complain(message: str) -> int:
     echo("error: " + " ".join(message.split()), error=True)
     return _BAD_INPUT
+
+
+def _stopped() -> int:
+    echo("stopped before the end; files that were written are kept", error=True)
+    return INTERRUPTED
 
 
 def _usage_message(error: Any, words: list[str]) -> str:

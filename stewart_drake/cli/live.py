@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import typer
 
-from stewart_drake.cli.common import SIGNALS, Chosen, Delivery, check_log
+from stewart_drake.cli.common import SIGNALS, Chosen, Delivery, check_log, command_line
 from stewart_drake.cli.options import Given, command
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.live.options import LiveOptions, MachineOptions
@@ -73,12 +73,11 @@ def live(
     options = given.options()
     with given.named():
         options.check_learned()
-    loaded, name = chosen.load(), chosen.title
+    loaded, name = _in_real_time(chosen), chosen.title
     span = math.inf if options.duration is None else options.duration
     if options.learn:
         typed = {"machine": machine, "demo": demo, **given.words}
-        shown = {name: value for name, value in typed.items() if value}
-        line = chosen.line("live", **shown, out=delivery.out)
+        line = chosen.line("live", **{k: v for k, v in typed.items() if v}, out=delivery.out)
         return _learn(chosen, loaded, machine, options, delivery, line)
 
     from stewart_drake.live.contact import parse_address
@@ -124,8 +123,18 @@ def live(
                 ready, span, ending=ending, say=delivery.say_wrapped, accept_jitter=True, **how
             )
     if options.log is not None:
-        delivery.say(f"log written to {options.log}")
-    return _delivered(delivery, result, LOG)
+        show = command_line("replay", str(options.log))
+        delivery.say(f"log written to {options.log}: {show}")
+    return _delivered(delivery, result, LOG, "log.yaml")
+
+
+def _in_real_time(chosen: Chosen) -> "Scenario":
+    """Return the scenario; refuse a setting of its duration, which has no effect in real time."""
+    for setting in chosen.settings:
+        name, _, value = setting.partition("=")
+        if name.strip() == "duration":
+            raise ConfigError(f"--set: duration: got {value!r}; expected --duration SECONDS")
+    return chosen.load()
 
 
 def _learn(
@@ -324,7 +333,7 @@ def machine(*, chosen: Chosen, given: Given, delivery: Delivery) -> int:
     from stewart_drake.live.reachy import open_chosen
     from stewart_drake.scenario.link import link_text
 
-    options, loaded, interrupted = given.options(), chosen.load(), False
+    options, loaded, interrupted = given.options(), _in_real_time(chosen), False
     check_log(options.log)
     with given.named(), open_chosen(loaded, options, delivery.say_wrapped) as (running, address):
         if network := link_text(loaded, bound=False):

@@ -250,7 +250,7 @@ int stewart_closed_loop(stewart_run *r, stewart_loop *o, stewart_controller law,
         if (outcome == STEWART_INSIDE && is_sample)
             outcome = sample(&s, o, k++, law, context);
         else if (outcome == STEWART_INSIDE)
-            stewart_link_change(o->link, o->memory, fmax(released, s.time));
+            stewart_link_change(o->link, o->memory, released);
         if (outcome != STEWART_INSIDE)
             return finish(r, &s, outcome);
     }

@@ -1,6 +1,8 @@
 """Checks of a live run, and references from where the plate is."""
 
+import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -9,6 +11,9 @@ from stewart_drake.dynamics.workspace import diagnose
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.timeline import Timeline, TorqueSchedule
 from stewart_drake.live.governor import Steering
+from stewart_drake.loop.preparation import Experiment, check_reach
+from stewart_drake.mechanism.trajectories import make_reference
+from stewart_drake.scenario.reference_config import SineConfig
 from stewart_drake.scenario.signals import NUM_TORQUES, POSE, RATES
 from stewart_drake.types import Array
 
@@ -16,8 +21,27 @@ _ROWS: Final = 8
 """Number of consecutive torques reported a period off that count as an error."""
 _KEPT: Final = 64
 """Number of periods whose sent torques are kept."""
+_LONGEST: Final = 600.0
+"""Checked part of a motion that does not repeat, s."""
 REPLAN_ERROR: Final = 0.08
 """Smallest prediction error at which a new reference is planned, as a share of the motion."""
+
+
+def check_whole_motion(experiment: Experiment, duration: float) -> None:
+    """Check the motion of a run, which may be longer than the scenario's duration, in s.
+
+    Raises:
+        ConfigError: it leaves the workspace, or its file ends while it still moves.
+    """
+    scenario, reference = experiment.scenario, experiment.scenario.reference
+    if isinstance(reference, SineConfig):
+        frequencies = {*reference.angular_frequency}
+        whole = 2 * math.pi / frequencies.pop() if len(frequencies) == 1 else _LONGEST
+    else:
+        whole = float(make_reference(reference, 0.0).times[-1:].sum()) + 1  # with the rest after it
+    longer = replace(scenario, duration=max(scenario.duration, min(duration, whole)))
+    make_reference(reference, longer.duration)
+    check_reach(experiment._replace(scenario=longer))
 
 
 class DelayCheck:

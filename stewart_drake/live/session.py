@@ -13,6 +13,8 @@ import numpy as np
 
 from stewart_drake.dynamics.native_functions import one_blas_thread
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.fileio import write_whole
+from stewart_drake.live.checks import check_whole_motion
 from stewart_drake.live.contact import Contact, await_free, call, open_endpoint, parse_address
 from stewart_drake.live.design import (
     Design,
@@ -43,6 +45,7 @@ from stewart_drake.loop.results import LEAST_MEASURED, LiveSummary, SimulationRe
 from stewart_drake.reporting.document import templates
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.link_config import NetworkConfig, WireConfig
+from stewart_drake.scenario.loading import scenario_yaml
 from stewart_drake.scenario.run_log import Background, RunLog, UdpMirror, open_log
 from stewart_drake.scenario.signals import NUM_TORQUES, POSE
 from stewart_drake.studies.verdict import Verdict, delay_range, milliseconds
@@ -263,16 +266,19 @@ def drive(
         pace: pole of the governor, 1/s; by default it depends on the torque limit.
 
     Raises:
-        ConfigError: not armed for a real machine, too much jitter, or a machine that does not
-            begin.
+        ConfigError: not armed for a real machine, too much jitter, a motion out of reach, or a
+            machine that does not begin.
     """
     check_armed(ready, armed)
     check_jitter(ready, accept_jitter)
+    check_whole_motion(ready.design.experiment, duration)
     made, contact = ready.design, ready.contact
     # Holds of a period follow no faster one.
     fastest, slowest = min(FASTEST, 1 / made.law.timeline.period), PACE
     if pace is not None:
         fastest = slowest = pace
+    if log is not None:  # of a run that is killed there is no summary
+        write_whole(log.with_suffix(".yaml"), scenario_yaml(made.experiment.scenario))
     governor = Governor(made.law.plant.dynamics, made.torque_limit, fastest, slowest)
     steering = Steering(governor, made.experiment.reference, Way.along(made.planned))
     kind = CrankLoop if made.cranks else LiveLoop

@@ -83,6 +83,13 @@ COVERED: Final[Accepted] = {
     "sensor.faults": [],
 }
 """Values of the fields that the loop in C covers."""
+_COVERED_SERVOS: Final[Accepted] = {
+    "link.kind": "wire",
+    "controller.estimate": [],
+    "controller.learned": None,
+    "sensor.delay": 0.0,  # the servos' reports come with the measurements
+    "sensor.loss": 0.0,
+}
 _OF_A_RUN: Final = (
     *(("plant", name) for name in ("payload_mass", "torque_bias", "joint_damping")),
     *(("plant", name) for name in ("coulomb_friction", "push")),
@@ -127,13 +134,8 @@ def instants_of(duration: float, period: float) -> Instants:
 def uncovered(scenario: Scenario) -> str | None:
     """Return the field of a scenario that needs Drake's loop, or None."""
     found = differing(scenario, COVERED)
-    servos = scenario.actuator.kind == "position_servo"
-    if found is None and servos:
-        if scenario.link.kind == "network":
-            return "link.kind"
-        for name in ("estimate", "learned"):
-            if getattr(scenario.controller, name):
-                return f"controller.{name}"
+    if found is None and scenario.actuator.kind == "position_servo":
+        found = differing(scenario, _COVERED_SERVOS)
     return found and found.field
 
 

@@ -55,7 +55,7 @@ Fraction = Annotated[
 ]
 TorqueLimit = Annotated[
     Positive | Literal["none"] | None,
-    one_message("a number above 0 and of at most 1e6, none for no limit"),
+    one_message("a number above 0 and of at most 1e6 N m, none for no limit"),
 ]
 Seed = Annotated[int, Field(ge=0, lt=2**32)]
 Steps = Annotated[

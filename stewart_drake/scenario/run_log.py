@@ -11,6 +11,7 @@ With position servos a log ends with SERVO_SIGNALS, for `identification.servo_lo
 import contextlib
 import copy
 import csv
+import fcntl
 import json
 import logging
 import math
@@ -89,6 +90,21 @@ def open_log(path: Path, scenario: Scenario, servos: bool = True) -> RunLog:
         ) from None
 
 
+def _emptied(path: Path) -> int:
+    """Return the descriptor of an empty file, which others cannot open here until it is closed."""
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        os.ftruncate(descriptor, 0)
+    except OSError as error:
+        os.close(descriptor)
+        if isinstance(error, BlockingIOError):
+            problem = "another log is being written there; expected another name"
+            raise ConfigError(f"{path}: {problem}") from None
+        raise
+    return descriptor
+
+
 def _members(fields: Iterable[str], values: Array) -> dict[str, float]:
     """Return the finite components by field; JSON has no NaN."""
     pairs = zip(fields, np.atleast_1d(values).tolist(), strict=True)
@@ -110,7 +126,7 @@ class McapLog:
 
     def __init__(self, path: Path, scenario: Scenario, servos: bool = True) -> None:
         writer, self._path = _mcap("mcap.writer"), path
-        self._file = open(path, "wb")  # noqa: SIM115 (closed by `close`)
+        self._file = os.fdopen(_emptied(path), "wb")
         self._writer = writer.Writer(self._file, chunk_size=_CHUNK)
         self._writer.start(profile="", library=f"stewart_drake {versions()['stewart-drake']}")
         about = {"scenario": scenario_yaml(scenario), "versions": json.dumps(versions())}
@@ -160,8 +176,7 @@ class CsvFile:
             with tempfile.TemporaryFile() as file:
                 self.descriptor = os.dup(file.fileno())
         else:
-            flags = os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC
-            self.descriptor = os.open(path, flags, 0o666)
+            self.descriptor = _emptied(path)
         self._whole, self._path = 0, path
         self._add(heads)
 
@@ -194,8 +209,8 @@ class CsvLog:
                 f"{path}: its scenario would replace {companion.name}, which is of no log; "
                 "expected another name"
             )
-        write_whole(companion, scenario_yaml(scenario))
         self._file = CsvFile(path, csv_heads(self._channels))
+        write_whole(companion, scenario_yaml(scenario))
 
     def write(self, time: float, values: Mapping[str, Array]) -> None:
         numbers = [time]
@@ -348,7 +363,7 @@ def read_log(path: str | Path) -> xr.Dataset:
         raise ConfigError(f"{path}: got a file of another kind; expected {EXPECTED}")
     try:
         return _read_csv(path) if path.suffix == ".csv" else _read_mcap(path)
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, csv.Error) as error:
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         raise ConfigError(f"{path}: cannot be read ({reason}); expected {EXPECTED}") from None
 

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from numbers import Integral, Real
 from typing import Final, NamedTuple
 
+from stewart_drake.files.errors import ConfigError
+
 METRIC_PERIOD: Final = 0.02
 """Grid of the accumulated error, s, which the steps of a discrete plant have to hit."""
 MOST_INSTANTS: Final = 5_000_000
@@ -177,9 +179,9 @@ class Delay:
     def __post_init__(self) -> None:
         numbers = isinstance(self.steps, Integral) and isinstance(self.fraction, Real)
         if not (numbers and self.steps >= 0 and 0 <= self.fraction < 1):
-            raise ValueError(
+            raise ConfigError(
                 f"delay: got {self.steps!r} steps and a fraction of {self.fraction!r}; expected "
-                "whole steps >= 0 and 0 <= fraction < 1"
+                "whole steps of at least 0, and a fraction of a step from 0 to below 1"
             )
 
     @classmethod
