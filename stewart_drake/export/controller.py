@@ -76,8 +76,8 @@ TOLERANCES: Final = {"double": 1e-9, "float": 1e-3}
 MOST_IN_SINGLE: Final = 100
 """Largest number of samples of a replay in single precision.
 
-Later in `gravity` errors exceed 1e-3: half an ulp of the estimated height, predicted over the
-delay, times the gain, is 4e-4 N m.
+Later errors in `gravity` over a network exceed 1e-3: half an ulp of the measured height, predicted
+over the delay, times the gain, is up to 2e-3 of the peak torque.
 """
 
 
