@@ -109,7 +109,7 @@ class Filter:
             root, outlier, noise = estimate.root, estimate.outlier, estimate.noise
         else:
             root, outlier = np.linalg.cholesky(estimate.covariance), np.full(m, np.nan)
-            counts, noise = [0] * 6, np.eye(1, c.lib.STEWART_NOISE)[0]
+            counts, noise = [0] * 6, np.eye(1, 12 + c.lib.STEWART_NOISE, 12)[0]
         memory = np.concatenate([estimate.mean, root.ravel(), outlier, counts, noise])
         torques, durations, following = map(numbers, period[:3])
         schedule = [len(torques), c.at(torques), c.at(durations), period.substeps]

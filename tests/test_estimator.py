@@ -71,7 +71,7 @@ def transition(dynamics, xi, period):
     schedule = [number, c.at(period.torques), c.at(period.durations), period.substeps]
     until, scratch = c.ffi.new("stewart_schedule *", schedule), c.lib.stewart_transitions_scratch(8)
     machine = machine_of(NominalPlant(dynamics, 1, np.inf, TorqueLimit()))
-    c.lib.stewart_predict(machine.pointer, c.at(xi[12:]), until, c.at(xi), c.at(states))
+    c.lib.stewart_predict(machine.pointer, c.at(xi[12:]), until, c.at(xi), c.ffi.NULL, c.at(states))
     along = c.at(xi), until, 1, c.at(states), H[0].size, c.at(H)
     assert c.lib.stewart_transitions(machine.pointer, *along, c.scratch(scratch))
     F[:12] = H[-1]

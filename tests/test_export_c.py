@@ -208,15 +208,17 @@ def test_a_controller_that_is_off_is_reported(tmp_path):
     ("name", "settings"),
     [
         ("gravity", ()),
+        ("gravity", ("controller.estimate=[]",)),
         ("motion_base", ("sensor.kind=encoders",)),
         ("paper", ("sensor.kind=encoders", "sensor.bits=14", "sensor.samples=20")),
         ("paper", ("controller.delay_estimator=constant", "controller.delay_steps=6")),
         ("paper", ("link.kind=network", "link.loss=0.1")),
     ],
-    ids=["estimator", "plan in flight", "encoders", "delay", "network"],
+    ids=["estimator", "measured state", "plan in flight", "encoders", "delay", "network"],
 )
-def test_single_precision_is_close(name, settings, tmp_path):
-    """1e-3 of the peak of the replay in double precision, over the exported samples."""
+def test_single_precision_is_close(name, settings, tmp_path, monkeypatch):
+    """1e-3 of the peak of the replay in double precision, over 10 s."""
+    monkeypatch.setattr(export_c, "MOST_IN_SINGLE", 1000)
     scenario = load_scenario(name, settings=("plant.kind=exact", *settings))
     export_c.write(export_c.exported(scenario, single=True, measured=False), tmp_path)
     said = make(tmp_path, "test")

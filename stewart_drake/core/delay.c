@@ -103,7 +103,7 @@ static int predict(const stewart_period *t, const real *xi, Path *path, real *st
     if (!schedule_between(t, xi, 0, t->delay->period, path))
         return 0;
     const stewart_schedule schedule = {path->number, path->torques, path->durations, 0};
-    stewart_predict(t->delay->filter.machine, xi + X, &schedule, xi, path->states);
+    stewart_predict(t->delay->filter.machine, xi + X, &schedule, xi, NULL, path->states);
     stewart_copy(X, path->states + X * (path->number - 1), state);
     return 1;
 }
@@ -429,7 +429,7 @@ static int correct(Model *a, const stewart_hypothesis *hypothesis, const real *L
     upper[STEWART_RATE(n)] = free_rate ? LARGEST_RATE : (real)INFINITY;
     const stewart_kalman filter = {
         n, m, std > d->period / 100 ? MAX_ITERATIONS : MAX_ITERATIONS_KNOWN, a->mean, L, lower, upper, a,
-        whitened_rows, stewart_measurement_relinearize, 0, NULL, NULL};
+        whitened_rows, stewart_measurement_relinearize, NULL, 0, NULL, NULL};
     if (!stewart_kalman_update(&filter, xi, root, &distance, &log_ratio, scratch))
         return 0;
     if (!(distance <= d->filter.gate)) /* or NaN */

@@ -158,5 +158,5 @@ static void delayed_outlook(const stewart_law *law, const real *memory, int numb
 const stewart_observer stewart_delay_observer = {
     delayed_memory, delayed_scratch,    delayed_start,   delayed_observe,
     delayed_start,  delayed_parameters, delayed_outlook, delayed_last_period,
-    delayed_uncertainty,
+    delayed_uncertainty, NULL,
 };

@@ -32,5 +32,5 @@ static int differences_scratch(const stewart_law *law)
 
 const stewart_observer stewart_differences_observer = {
     stewart_plain_memory,  differences_scratch,      stewart_plain_start, differences_observe,
-    stewart_plain_restart, stewart_plain_parameters, NULL, NULL, NULL,
+    stewart_plain_restart, stewart_plain_parameters, NULL, NULL, NULL, NULL,
 };

@@ -3,6 +3,7 @@
 #include <string.h>
 
 #include "dynamics.h"
+#include "matrix.h"
 
 #include "equations.h"
 #include "short.h"
@@ -117,7 +118,7 @@ void stewart_measures(const real *geometry, const real *pose, const real *angles
     all_measures(pose, sines, wrenches, measures);
 }
 
-void stewart_runge_kutta_step(const stewart_plant *plant, const real *torque, real h, real *x)
+void stewart_runge_kutta_step(const stewart_plant *plant, const real *torque, real h, real *x, real *low)
 {
     static const real part[3] = {(real)0.5, (real)0.5, 1};
     real y[12], k[4][12];
@@ -126,8 +127,9 @@ void stewart_runge_kutta_step(const stewart_plant *plant, const real *torque, re
         stewart_change(plant, y, torque, k[stage]);
         if (stage < 3)
             for (int i = 0; i < 12; i++)
-                y[i] = x[i] + part[stage] * h * k[stage][i];
+                y[i] = x[i] + (low[i] + part[stage] * h * k[stage][i]);
     }
     for (int i = 0; i < 12; i++)
-        x[i] += h / 6 * (k[0][i] + 2 * k[1][i] + 2 * k[2][i] + k[3][i]);
+        y[i] = h / 6 * (k[0][i] + 2 * k[1][i] + 2 * k[2][i] + k[3][i]);
+    stewart_accumulate(12, y, x, low);
 }

@@ -56,5 +56,6 @@ void stewart_residual_derivatives(const stewart_plant *plant, const real *pose, 
    parallel singularity, and -|pitch|. `angles` are those of the cranks if known, else NULL. */
 void stewart_measures(const real *geometry, const real *pose, const real *angles, real *measures);
 
-/* Advance a state (12) by one step of h seconds of the classical Runge-Kutta method. */
-void stewart_runge_kutta_step(const stewart_plant *plant, const real *torque, real h, real *state);
+/* Advance a state (12) by one step of h seconds of the classical Runge-Kutta method; `low` as of
+   `stewart_accumulate`. */
+void stewart_runge_kutta_step(const stewart_plant *plant, const real *torque, real h, real *state, real *low);

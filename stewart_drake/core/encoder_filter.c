@@ -86,7 +86,8 @@ static int predict_readings(EncoderUpdate *s, const real *xi, stewart_scratch sc
     const stewart_filter *f = a->filter;
     const stewart_encoders *encoders = s->encoders;
     const int n = a->n, last = s->coarse.number - 1;
-    stewart_predict(f->machine, xi + X, &s->coarse, xi, s->states);
+    stewart_copy(X, a->after->low, a->end_low);
+    stewart_predict(f->machine, xi + X, &s->coarse, xi, a->end_low, s->states);
     /* Fourth order where the pieces are long: one or two in the period. */
     if (!stewart_transitions(f->machine, xi, &s->coarse, s->coarse.number <= 2, s->states, X * n, s->H,
                              scratch))
@@ -95,7 +96,7 @@ static int predict_readings(EncoderUpdate *s, const real *xi, stewart_scratch sc
     a->transition = s->H + X * n * last;
     if (!a->values)
         return 1;
-    stewart_predict(f->machine, xi + X, &s->fine, xi, s->fine_states);
+    stewart_predict(f->machine, xi + X, &s->fine, xi, NULL, s->fine_states);
     for (int k = 0; k < encoders->samples; k++) {
         real *angles = s->predicted + LEGS * k;
         stewart_crank_angles(encoders->geometry, s->fine_states + X * (int)s->samples[k], angles);
@@ -209,16 +210,14 @@ static int residuals_of_encoders(void *context, const real *xi, real *e, real *H
 }
 
 /* Predict from an updated xi. Returns 1 if the change is small, 0 to go on, -1 without a prediction. */
-static int relinearize(void *context, const real *xi, const real *updated, stewart_scratch scratch)
+static int relinearize(void *context, const real *change, const real *updated, stewart_scratch scratch)
 {
     EncoderUpdate *s = context;
     const int n = s->attempt->n;
     int small = 1;
     for (int row = 0; row < s->number; row++) {
-        real change = 0;
-        for (int j = 0; j < n; j++)
-            change += s->rows[n * row + j] * (updated[j] - xi[j]);
-        small = small && REAL(fabs)(change) <= SMALL;
+        const real moved = stewart_dot(n, s->rows + n * row, change);
+        small = small && REAL(fabs)(moved) <= SMALL;
     }
     if (small)
         return 1;
@@ -283,13 +282,14 @@ static int attempt(stewart_attempt *a, stewart_scratch scratch)
     stewart_read(s.encoders, a->values, s.predicted, history->last, history->unchanged, &s.reading, scratch);
     const stewart_kalman update = {a->n,     LEGS * s.encoders->nodes, MAX_ITERATIONS, a->prior->mean,
                                    a->prior->root, f->lower, f->upper, &s, residuals_of_encoders, relinearize,
-                                   0, innovations, variances};
+                                   a->after->low, 0, innovations, variances};
     if (!stewart_kalman_update(&update, xi, a->after->root, &distance, &log_ratio, scratch))
         return 0;
     *a->after->chi2 += distance;
     *a->after->chi2_values += (real)s.number;
     stewart_attempt_learn(a, s.number, innovations, variances, s.rows, s.effects);
-    stewart_predict(f->machine, xi + X, schedule, xi, s.fine_states);
+    stewart_copy(X, a->after->low, a->end_low);
+    stewart_predict(f->machine, xi + X, schedule, xi, a->end_low, s.fine_states);
     stewart_copy(X, s.fine_states + X * (schedule->number - 1), a->end_state);
     return stewart_attempt_finish(a, scratch);
 }

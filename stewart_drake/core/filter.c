@@ -22,7 +22,7 @@
 
 int stewart_posterior_size(int n, int m)
 {
-    return n + n * n + m + 6 + STEWART_NOISE;
+    return n + n * n + m + 6 + X + STEWART_NOISE;
 }
 
 stewart_posterior stewart_posterior_at(real *numbers, int n, int m)
@@ -30,7 +30,7 @@ stewart_posterior stewart_posterior_at(real *numbers, int n, int m)
     real *counts = numbers + n + n * n + m;
     return (stewart_posterior){numbers,    numbers + n, numbers + n + n * n, counts, counts + 1,
                                counts + 2, counts + 3,  counts + 4,          counts + 5,
-                               (stewart_noise *)(counts + 6)};
+                               counts + 6, (stewart_noise *)(counts + 6 + X)};
 }
 
 static int size_of(const stewart_filter *filter) { return X + filter->machine->estimated; }
@@ -78,6 +78,7 @@ int stewart_attempt_finish(stewart_attempt *a, stewart_scratch scratch)
     stewart_root_of_prediction(n, a->transition, a->end_std, walk, a->changes, a->timing_root, after->root,
                                scratch);
     stewart_copy(X, a->end_state, after->mean);
+    stewart_copy(X, a->end_low, after->low);
     *after->left_out = (real)a->left_out;
     return stewart_all_finite(n, after->mean) && stewart_all_finite(n * n, after->root);
 }
@@ -85,7 +86,7 @@ int stewart_attempt_finish(stewart_attempt *a, stewart_scratch scratch)
 /* An attempt with a measurement of the state at the period's end. */
 typedef struct {
     stewart_measurement measurement;
-    const stewart_attempt *attempt;
+    stewart_attempt *attempt;
     int fourth_order;
     real *states; /* (number, 12) */
 } EndUpdate;
@@ -94,7 +95,8 @@ static int predict(void *context, const real *xi, real *end)
 {
     EndUpdate *s = context;
     const stewart_schedule *schedule = &s->attempt->period->schedule;
-    stewart_predict(s->attempt->filter->machine, xi + X, schedule, xi, s->states);
+    stewart_copy(X, s->attempt->after->low, s->attempt->end_low);
+    stewart_predict(s->attempt->filter->machine, xi + X, schedule, xi, s->attempt->end_low, s->states);
     stewart_copy(X, s->states + X * (schedule->number - 1), end);
     return 1;
 }
@@ -111,12 +113,13 @@ static int linearize(void *context, const real *xi, real *H, stewart_scratch scr
 static int begin(EndUpdate *s, const real *xi, real *end, stewart_scratch scratch)
 {
     const int n = s->attempt->n;
-    real *cache = s->attempt->cache, *mean = cache + 1, *last = mean + n, *H = last + X;
+    real *cache = s->attempt->cache, *mean = cache + 1, *last = mean + n, *low = last + X, *H = low + X;
     int same = cache[0] == (real)s->fourth_order;
     for (int i = 0; i < n && same; i++)
         same = mean[i] == xi[i];
     if (same) {
         stewart_copy(X, last, end);
+        stewart_copy(X, low, s->attempt->end_low);
         stewart_copy(X * n, H, s->measurement.H);
         return 1;
     }
@@ -125,11 +128,12 @@ static int begin(EndUpdate *s, const real *xi, real *end, stewart_scratch scratc
     cache[0] = (real)s->fourth_order;
     stewart_copy(n, xi, mean);
     stewart_copy(X, end, last);
+    stewart_copy(X, s->attempt->end_low, low);
     stewart_copy(X * n, s->measurement.H, H);
     return 1;
 }
 
-static int cache_size(int n) { return 1 + n + X + X * n; }
+static int cache_size(int n) { return 1 + n + 2 * X + X * n; }
 
 void stewart_attempt_learn(const stewart_attempt *a, int m, const real *innovations,
                            const real *variances, const real *H, const real *effects)
@@ -159,8 +163,8 @@ static int attempt_sample(stewart_attempt *a, stewart_scratch scratch)
     EndUpdate s = {.attempt = a, .fourth_order = !is_known(f, prior->root, KNOWN)};
     real *xi = a->after->mean, log_ratio;
     real *innovations = stewart_take(&scratch, m), *variances = stewart_take(&scratch, m);
-    s.measurement = (stewart_measurement){f->sensing, a->values, n,  a->end_state,  NULL,
-                                  NULL,       NULL,      &s, predict, linearize};
+    s.measurement = (stewart_measurement){f->sensing, a->values, n,  a->end_state,  a->end_low,
+                                  NULL,       NULL,      NULL, &s, predict, linearize};
     s.measurement.C = stewart_take(&scratch, m * m);
     s.measurement.J = stewart_take(&scratch, m * X);
     s.states = stewart_take(&scratch, X * pieces);
@@ -174,8 +178,8 @@ static int attempt_sample(stewart_attempt *a, stewart_scratch scratch)
                                  s.measurement.C, scratch))
         return 0;
     const stewart_kalman update = {n, m, ITERATIONS, prior->mean, prior->root, f->lower, f->upper, &s,
-                                   stewart_measurement_residuals, stewart_measurement_relinearize, a->max_distance,
-                                   innovations, variances};
+                                   stewart_measurement_residuals, stewart_measurement_relinearize,
+                                   a->after->low, a->max_distance, innovations, variances};
     if (!stewart_kalman_update(&update, xi, a->after->root, &a->distance, &log_ratio, scratch))
         return 0;
     a->log_likelihood = -(a->distance + log_ratio) / 2;
@@ -196,6 +200,7 @@ static int attempt(stewart_attempt *a, stewart_scratch scratch)
     a->left_out = a->gated_legs = 0;
     a->log_likelihood = -(real)INFINITY;
     stewart_copy(a->n, a->prior->mean, a->after->mean);
+    stewart_copy(X, a->prior->low, a->after->low);
     *a->after->chi2 = *a->prior->chi2;
     *a->after->chi2_values = *a->prior->chi2_values;
     *a->after->noise = *a->prior->noise;
@@ -230,6 +235,7 @@ int stewart_filter_start(const stewart_filter *filter, const real *values, const
         e.mean[X + i] = theta[i];
     }
     stewart_copy(X, state, e.mean);
+    stewart_fill(X, 0, e.low);
     stewart_fill(m, (real)NAN, e.outlier);
     *e.outliers = *e.age = *e.left_out = *e.disagreed = 0;
     return 1;
@@ -286,6 +292,7 @@ static void accept(int n, int m, const stewart_posterior *found, stewart_posteri
 {
     stewart_copy(n, found->mean, now->mean);
     stewart_copy(n * n, found->root, now->root);
+    stewart_copy(X, found->low, now->low);
     stewart_fill(m, (real)NAN, now->outlier);
     *now->outliers = *now->age = *now->disagreed = 0;
     *now->left_out = *found->left_out;

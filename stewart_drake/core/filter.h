@@ -33,6 +33,7 @@ typedef struct {
     real *chi2;     /* sum of nu' S^-1 nu of all measurements that were used */
     real *chi2_values; /* number of values in them */
     real *disagreed; /* outliers since a measurement was last used that disagree with the one before */
+    real *low;      /* (12) as of `stewart_accumulate`, of the state */
     stewart_noise *noise; /* factors of the assumed noise */
 } stewart_posterior;
 

@@ -14,6 +14,7 @@ typedef struct {
     const stewart_history *history;
     stewart_posterior *after;      /* result; its mean begins as that of the prior */
     real end_state[STEWART_STATES]; /* at the end of the period */
+    real end_low[STEWART_STATES];   /* as of `stewart_accumulate`, of `end_state` */
     const real *transition;        /* (12, n) d[end_state]/d[xi] */
 
     /* Errors of the model over the period, as standard deviations of `end_state`. The timing of torques has

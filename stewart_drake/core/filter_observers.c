@@ -38,6 +38,7 @@ static void filtered_restart(const stewart_law *law, real *memory)
     const Filtered f = filtered_at(law, memory);
     const stewart_posterior e = f.estimate;
     stewart_fill(X, (real)NAN, e.mean);
+    stewart_fill(X, 0, e.low);
     stewart_fill(n * n, (real)NAN, e.root);
     stewart_fill(law->num_values, (real)NAN, e.outlier);
     *e.outliers = *e.age = *e.left_out = *e.disagreed = 0;
@@ -72,6 +73,11 @@ static real filtered_uncertainty(const stewart_law *law, const real *memory, rea
     if (L)
         stewart_copy(n * n, e.root, L);
     return REAL(sqrt)(stewart_timing_scatter(e.noise)) * settings->filter.timing_std;
+}
+
+static const real *filtered_low(const stewart_law *law, const real *memory)
+{
+    return filtered_at(law, (real *)memory).estimate.low;
 }
 
 static stewart_filter filter_of(const stewart_law *law, const stewart_sensing *sensing)
@@ -150,6 +156,7 @@ const stewart_observer stewart_filter_observer = {
     .restart = filtered_restart,
     .parameters = filtered_parameters,
     .uncertainty = filtered_uncertainty,
+    .low = filtered_low,
 };
 
 /* ---- over gaps -----------------------------------------------------------------------------------
@@ -272,4 +279,5 @@ const stewart_observer stewart_gap_observer = {
     .restart = filtered_restart,
     .parameters = filtered_parameters,
     .uncertainty = filtered_uncertainty,
+    .low = filtered_low,
 };

@@ -204,7 +204,7 @@ int stewart_within_bounds(int n, const real *mean, const real *L, const real *lo
 int stewart_kalman_scratch(int n, int max_rows)
 {
     const int active = STEWART_MAX_BOUNDED * STEWART_MAX_BOUNDED;
-    return max_rows + max_rows * n + (max_rows + n + 1) * (n + 1) + 2 * n + active;
+    return max_rows + max_rows * n + (max_rows + n + 1) * (n + 1) + 5 * n + active;
 }
 
 /* With whitened residuals the updated mean is xi = mean + L z, with z the minimum of
@@ -222,7 +222,12 @@ int stewart_kalman_update(const stewart_kalman *filter, real *xi, real *root, re
     const int n = filter->n, N = n + 1;
     real *e = stewart_take(&scratch, filter->max_rows), *H = stewart_take(&scratch, filter->max_rows * n);
     real *R = stewart_take(&scratch, N * N), *W = stewart_take(&scratch, filter->max_rows * N);
-    real *change = stewart_take(&scratch, n), *updated = change; /* one after the other */
+    real *change = stewart_take(&scratch, n), *updated = stewart_take(&scratch, n);
+    real *first = stewart_take(&scratch, n), *low = stewart_take(&scratch, n); /* of the prior, of xi */
+    stewart_fill(n, 0, first);
+    if (filter->low)
+        stewart_copy(X, filter->low, first);
+    stewart_copy(n, first, low);
     for (int round = 0; round < filter->iterations; round++) {
         const int m = filter->residuals(filter->context, xi, e, H, scratch);
         if (m < 0)
@@ -253,20 +258,25 @@ int stewart_kalman_update(const stewart_kalman *filter, real *xi, real *root, re
         for (int i = 0; i < n; i++) { /* root R = L, row by row */
             const real *l = filter->root + n * i;
             real *x = root + n * i;
-            real mean = filter->mean[i];
+            real sum = first[i];
             stewart_copy(n, l, x);
             for (int j = 0; j < n; j++) {
                 x[j] /= R[N * j + j];
                 for (int k = j + 1; k < n; k++)
                     x[k] -= x[j] * R[N * j + k];
-                mean += x[j] * R[N * j + n];
+                sum += x[j] * R[N * j + n];
             }
-            updated[i] = mean;
+            change[i] = filter->mean[i] - xi[i] + (sum - low[i]);
+            updated[i] = filter->mean[i] + sum;
+            if (filter->low && i < X)
+                filter->low[i] = low[i] = sum - (updated[i] - filter->mean[i]);
         }
         stewart_copy(n, updated, R);
         if (!stewart_within_bounds(n, R, root, filter->lower, filter->upper, updated, scratch))
             return 0;
-        const int status = filter->relinearize(filter->context, xi, updated, scratch);
+        for (int i = 0; i < n; i++)
+            change[i] += updated[i] - R[i];
+        const int status = filter->relinearize(filter->context, change, updated, scratch);
         stewart_copy(n, updated, xi);
         if (status < 0)
             return 0;

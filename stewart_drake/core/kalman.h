@@ -12,8 +12,8 @@
    R = C C' they are C^-1 e and C^-1 H. Values that are left out have no row. Returns m, at most
    `max_rows`, or -1 without a prediction from xi.
 
-   `relinearize` ends an iteration, which corrected `xi` to `updated`. Returns 1 if the correction is small,
-   which ends the iterations. Otherwise it linearises at `updated`, and returns 0, or -1 if there is no
+   `relinearize` ends an iteration, whose `change` (n) corrects xi to `updated`. Returns 1 if it is small, which
+   ends the iterations. Otherwise it linearises at `updated`, and returns 0, or -1 if there is no
    prediction from there. */
 typedef struct {
     int n, max_rows;
@@ -22,7 +22,8 @@ typedef struct {
     const real *lower, *upper; /* (n), infinite without a bound */
     void *context;
     int (*residuals)(void *context, const real *xi, real *e, real *H, stewart_scratch scratch);
-    int (*relinearize)(void *context, const real *xi, const real *updated, stewart_scratch scratch);
+    int (*relinearize)(void *context, const real *change, const real *updated, stewart_scratch scratch);
+    real *low; /* (12) as of `stewart_accumulate`, of the first 12 of the prior, then of the result; or NULL */
     real max_distance; /* the update is given up if `distance` of the first iteration is larger; 0: never */
     real *innovations; /* (max_rows) result nu, whitened; or NULL */
     real *variances;   /* (max_rows) result, diagonal of S, whitened; or NULL */

@@ -161,12 +161,15 @@ static void estimate(const stewart_law *law, real *memory, const stewart_sample 
         outlook->caution *= ratio > 1 ? ratio * ratio : 1; /* not for NaN */
     }
     stewart_copy(X, observed, outlook->state);
+    stewart_fill(X, 0, outlook->low);
+    if (observer->low)
+        stewart_copy(X, observer->low(law, observed), outlook->low);
     observer->parameters(law, observed, outlook->theta, std);
     if (lag > 0 && stewart_all_finite(X, outlook->state)) {
         const stewart_schedule schedule =
             stewart_last_periods(law, length, in_flight, lag, scratch).schedule;
         real *states = stewart_take(scratch, X * schedule.number);
-        stewart_predict(&law->machine, outlook->theta, &schedule, outlook->state, states);
+        stewart_predict(&law->machine, outlook->theta, &schedule, outlook->state, outlook->low, states);
         stewart_copy(X, states + X * (schedule.number - 1), outlook->state);
     }
     if (law->design && law->design->outlook)
@@ -267,17 +270,18 @@ static void predict(const stewart_law *law, const stewart_outlook *outlook, cons
         law->design->predict(law, outlook, followed, integral, a);
         return;
     }
-    real *states = stewart_take(&scratch, X * (schedule->number + 1)), before[6];
+    real *states = stewart_take(&scratch, X * (schedule->number + 1)), before[6], low[X];
     /* Number of torques of the schedule in each period. */
     const int per_period = outlook->samples > 0 ? schedule->number / outlook->samples : 1;
     stewart_copy(X, outlook->state, states);
+    stewart_copy(X, outlook->low, low);
     stewart_copy(6, integral, a->integral);
     for (int i = 0; i < 6; i++)
         before[i] = outlook->state[i] - followed[i];
     if (outlook->fraction == 0 && outlook->predicted && !isnan(outlook->predicted[0]))
         stewart_copy(X * (schedule->number + 1), outlook->predicted, states);
     else
-        stewart_predict(&law->machine, outlook->theta, schedule, states, states + X);
+        stewart_predict(&law->machine, outlook->theta, schedule, states, low, states + X);
     for (int k = 0; k < outlook->samples; k++) {
         const real *wanted = followed + ROW * (k + 1), *end = states + X * per_period * (k + 1);
         const int limited = stewart_at_limit(&law->machine, per_period, schedule->torques + U * per_period * k);

@@ -65,12 +65,12 @@ void stewart_required_torque(const stewart_model *model, const real *row, real *
 }
 
 void stewart_advance(const stewart_model *model, const real *torque, real duration, int substeps,
-                     real *state)
+                     real *state, real *low)
 {
     real a[6];
     if (!model->acceleration_per_torque) {
         for (int i = 0; i < substeps; i++)
-            stewart_runge_kutta_step(&model->plant, torque, duration / (real)substeps, state);
+            stewart_runge_kutta_step(&model->plant, torque, duration / (real)substeps, state, low);
         return;
     }
     stewart_accelerate(model, state, torque, a);
@@ -81,8 +81,9 @@ void stewart_advance(const stewart_model *model, const real *torque, real durati
 }
 
 void stewart_predict(const stewart_machine *machine, const real *theta, const stewart_schedule *schedule,
-                     const real *state, real *states)
+                     const real *state, real *low, real *states)
 {
+    real none[X] = {0};
     if (machine->own) {
         machine->own->predict(machine, theta, schedule, state, states);
         return;
@@ -94,7 +95,8 @@ void stewart_predict(const stewart_machine *machine, const real *theta, const st
     stewart_set_model(machine, theta, &model);
     for (int k = 0; k < schedule->number; k++, state = states, states += X) {
         stewart_copy(X, state, states);
-        stewart_advance(&model, schedule->torques + U * k, schedule->durations[k], substeps, states);
+        stewart_advance(&model, schedule->torques + U * k, schedule->durations[k], substeps, states,
+                        low ? low : none);
     }
 }
 

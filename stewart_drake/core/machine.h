@@ -74,13 +74,14 @@ void stewart_accelerate(const stewart_model *model, const real *state, const rea
 /* Compute the torque (6) for a row of 18 numbers: pose, rates and accelerations. */
 void stewart_required_torque(const stewart_model *model, const real *row, real *torque);
 
-/* Advance a state (12) under a torque for a duration in s. */
+/* Advance a state (12) under a torque for a duration in s; `low` as of `stewart_accumulate`. */
 void stewart_advance(const stewart_model *model, const real *torque, real duration, int substeps,
-                     real *state);
+                     real *state, real *low);
 
-/* Predict the states (number, 12) after each torque of a schedule, from a state (12). */
+/* Predict the states (number, 12) after each torque of a schedule, from a state (12). `low` (12) as of
+   `stewart_accumulate` is that of the state, then of the last one; or NULL. */
 void stewart_predict(const stewart_machine *machine, const real *theta, const stewart_schedule *schedule,
-                     const real *state, real *states);
+                     const real *state, real *low, real *states);
 
 /* Compute A (12, 12), B (12, 6), G (12, p): derivatives of the state's time derivative by state, torque and
    theta. G may be NULL. Returns 0 where they do not exist. */

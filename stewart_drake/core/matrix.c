@@ -31,6 +31,15 @@ real stewart_dot(int n, const real *x, const real *y)
 
 real stewart_norm(int n, const real *x) { return REAL(sqrt)(stewart_dot(n, x, x)); }
 
+void stewart_accumulate(int n, const real *change, real *x, real *low)
+{
+    for (int i = 0; i < n; i++) {
+        const real sum = low[i] + change[i], before = x[i];
+        x[i] += sum;
+        low[i] = sum - (x[i] - before);
+    }
+}
+
 void stewart_transpose(int n, real *A)
 {
     for (int i = 0; i < n; i++)

@@ -24,6 +24,9 @@ void stewart_copy(int n, const real *from, real *to);
 void stewart_fill(int n, real value, real *x);
 real stewart_dot(int n, const real *x, const real *y);
 real stewart_norm(int n, const real *x);
+
+/* x + low (n) += change (n): `low` is what rounding takes off x. */
+void stewart_accumulate(int n, const real *change, real *x, real *low);
 void stewart_transpose(int n, real *A);
 void stewart_swap_rows(int n, real *a, real *b);
 

@@ -105,18 +105,19 @@ static int is_small(const stewart_measurement *a, const real *change, stewart_sc
 
 /* End the iterations, with the linearised prediction, if the correction changes it little. Otherwise predict again,
    and end them if that agrees with the linearised prediction: the old H then holds at `updated`, too. */
-int stewart_measurement_relinearize(void *context, const real *xi, const real *updated, stewart_scratch scratch)
+int stewart_measurement_relinearize(void *context, const real *change, const real *updated,
+                                    stewart_scratch scratch)
 {
     const stewart_measurement *a = context;
-    real shift[X], linearised[X];
+    real shift[X], linearised[X], none[X] = {0};
     for (int i = 0; i < X; i++) {
         shift[i] = 0;
         for (int j = 0; j < a->n; j++)
-            shift[i] += a->H[a->n * i + j] * (updated[j] - xi[j]);
+            shift[i] += a->H[a->n * i + j] * change[j];
         linearised[i] = a->state[i] + shift[i];
     }
     if (is_small(a, shift, scratch)) {
-        stewart_copy(X, linearised, a->state);
+        stewart_accumulate(X, shift, a->state, a->low ? a->low : none);
         return 1;
     }
     if (!a->predict(a->context, updated, a->state))

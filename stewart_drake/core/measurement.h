@@ -32,6 +32,7 @@ typedef struct {
     const real *values; /* (m) */
     int n;
     real *state;        /* (12) at the period's end, for the current xi */
+    real *low;          /* (12) as of `stewart_accumulate`, of `state`; or NULL */
     real *H;            /* (12, n) d[state]/d[xi] there */
     real *C;            /* (m, m) Cholesky factor of the covariance of measurement noise plus model error */
     real *J;            /* (m, 12) dh/dx at `state` */
@@ -48,4 +49,5 @@ void stewart_whitened_derivative(const stewart_measurement *a, real *H);
    ends at a correction below 0.1 standard deviations: the linearisation error, of second order, is then
    negligible. */
 int stewart_measurement_residuals(void *context, const real *xi, real *e, real *H, stewart_scratch scratch);
-int stewart_measurement_relinearize(void *context, const real *xi, const real *updated, stewart_scratch scratch);
+int stewart_measurement_relinearize(void *context, const real *change, const real *updated,
+                                    stewart_scratch scratch);

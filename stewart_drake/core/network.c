@@ -32,7 +32,7 @@ void stewart_plan_torques(const stewart_law *law, const stewart_outlook *outlook
         stewart_copy(U, torque - U, flying + U * pending);
         const stewart_schedule schedule =
             stewart_schedule_of(law->period, outlook->fraction, 1, flying, &rest);
-        stewart_predict(&law->machine, ahead->theta, &schedule, state, ends[0]);
+        stewart_predict(&law->machine, ahead->theta, &schedule, state, NULL, ends[0]);
         stewart_copy(X, ends[schedule.number - 1], state);
         memmove(flying, flying + U, (size_t)(U * pending) * sizeof(real)); /* still to act */
         stewart_copy(X, error, before);

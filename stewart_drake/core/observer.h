@@ -41,6 +41,7 @@ typedef struct {
     int assumed;        /* whether the delay is the assumed one */
     real caution;       /* factor on the weight of torques */
     real state[STEWART_STATES]; /* now; NaN before the first measurement */
+    real low[STEWART_STATES]; /* as of `stewart_accumulate`, of `state` */
     real theta[STEWART_MAX_ESTIMATED]; /* parameters */
     const real *observed;   /* memory of the observer */
     real eta;               /* s until the torque that is computed now begins to act */
@@ -80,6 +81,8 @@ typedef struct {
        NaN before the first estimate; L may be NULL. Returns the standard deviation of the timing of single
        torques, s. */
     real (*uncertainty)(const stewart_law *law, const real *memory, real *L);
+    /* NULL if it is 0. Return what rounding has taken off the state (12), as of `stewart_accumulate`. */
+    const real *(*low)(const stewart_law *law, const real *memory);
 } stewart_observer;
 
 /* Return the sensor model of a law. */

@@ -6,7 +6,7 @@ void stewart_predict_nominal(const stewart_law *law, int number, const real *tor
 {
     const stewart_schedule schedule = stewart_last_periods(law, number, torques, 1, &scratch).schedule;
     real *states = stewart_take(&scratch, X * schedule.number);
-    stewart_predict(&law->machine, NULL, &schedule, state, states);
+    stewart_predict(&law->machine, NULL, &schedule, state, NULL, states);
     stewart_copy(X, states + X * (schedule.number - 1), state);
 }
 
@@ -65,5 +65,5 @@ static int state_scratch(const stewart_law *law) { return X * X + stewart_nomina
 
 const stewart_observer stewart_state_observer = {
     stewart_plain_memory,  state_scratch,            stewart_plain_start, state_observe,
-    stewart_plain_restart, stewart_plain_parameters, NULL, NULL, NULL,
+    stewart_plain_restart, stewart_plain_parameters, NULL, NULL, NULL, NULL,
 };

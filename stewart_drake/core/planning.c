@@ -209,12 +209,13 @@ static int is_inside(const Plan *p, const real *pose)
 /* States under the torques. Returns 0 where one of them is out of the workspace. */
 static int respond(Plan *p)
 {
+    real low[X] = {0};
     for (int i = 0; i < p->number * p->pieces; i++) {
         const int k = i / p->pieces;
         real *state = p->states + X * (i + 1);
         stewart_copy(X, state - X, state);
         stewart_advance(p->model, p->torques + U * k,
-                        (p->edges[k + 1] - p->edges[k]) / (real)p->pieces, 1, state);
+                        (p->edges[k + 1] - p->edges[k]) / (real)p->pieces, 1, state, low);
     }
     for (int i = 0; i <= p->number * p->pieces; i++)
         if (!is_inside(p, p->states + X * i))

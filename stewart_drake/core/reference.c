@@ -204,7 +204,7 @@ static void predicted_rows(const stewart_course_input *m, const stewart_course *
     stewart_model model;
     stewart_set_model(m->machine, m->theta, &model);
     stewart_copy(X, m->state, states);
-    stewart_predict(m->machine, m->theta, until, states, states + X);
+    stewart_predict(m->machine, m->theta, until, states, NULL, states + X);
     stewart_copy(X, states + X * until->number, state);
     for (int i = 0; i < c->number; i++) {
         stewart_copy(X, state, rows + ROW * i);

@@ -138,7 +138,7 @@ static int replan_follow(const stewart_law *law, real *memory, const stewart_out
                          const stewart_sample *sample, stewart_scratch scratch)
 {
     const stewart_replan *replan = law->planning;
-    real wanted[ROW], *states = outlook->predicted;
+    real wanted[ROW], low[X], *states = outlook->predicted;
     if (!states)
         states = stewart_take(&scratch, X * (outlook->until_next.number + 1));
     memory[SINCE_PLAN] += 1;
@@ -151,7 +151,8 @@ static int replan_follow(const stewart_law *law, real *memory, const stewart_out
     if (outlook->settled && outlook->caution > MOST_CAUTION)
         return 0;
     stewart_copy(X, outlook->state, states);
-    stewart_predict(&law->machine, outlook->theta, &outlook->until_next, states, states + X);
+    stewart_copy(X, outlook->low, low);
+    stewart_predict(&law->machine, outlook->theta, &outlook->until_next, states, low, states + X);
     rows_of(law, memory, sample, 1, &outlook->eta, wanted);
     /* A known delay counts as found from the sample at which the first torque has acted for a period
        until the next plan. */

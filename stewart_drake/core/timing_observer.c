@@ -140,5 +140,5 @@ static real timing_uncertainty(const stewart_law *law, const real *memory, real 
 const stewart_observer stewart_timing_observer = {
     timing_memory,  timing_scratch,           timing_start, timing_observe,
     timing_restart, stewart_plain_parameters, NULL,         NULL,
-    timing_uncertainty,
+    timing_uncertainty, NULL,
 };

@@ -281,7 +281,7 @@ static void innovate(const stewart_tuner_input *in, real *innovation, real *late
     }
     real *states = stewart_take(&scratch, X * schedule->number);
     const real *last = schedule->torques + U * (schedule->number - 1);
-    stewart_predict(in->machine, in->theta, schedule, in->state, states);
+    stewart_predict(in->machine, in->theta, schedule, in->state, NULL, states);
     stewart_set_model(in->machine, in->theta, &model);
     if (schedule->number > 1)
         stewart_copy(U, last - U, acted);

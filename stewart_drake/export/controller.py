@@ -78,8 +78,8 @@ TOLERANCES: Final = {"double": 1e-9, "float": 1e-3}
 MOST_IN_SINGLE: Final = 100
 """Largest number of samples of a replay in single precision.
 
-Later in `gravity` errors exceed 1e-3: half an ulp of the estimated height, predicted over the
-delay, times the gain, is 4e-4 N m.
+Later errors in `gravity` over a network exceed 1e-3: half an ulp of the measured height, predicted
+over the delay, times the gain, is up to 2e-3 of the peak torque.
 """
 
 
@@ -95,11 +95,11 @@ CLOCKS: Final = {False: Clock("Cortex-M7", 400.0), True: Clock("Cortex-M4", 168.
 LINE: Final = 110
 """Length from which on a comment is above its line."""
 MILLIONS: Final = {
-    "ideal": {False: (1.99, 7.74), True: (2.24, 6.57)},
-    "ideal, without estimator": {False: (1.60, 1.94), True: (1.72, 2.04)},
-    "encoders": {False: (2.53, 8.15), True: (2.80, 7.01)},
-    "delay estimator": {False: (2.67, 42.0), True: (2.91, 42.0)},
-    "network": {False: (4.96, 5.44)},
+    "ideal": {False: (1.99, 7.76), True: (2.24, 6.58)},
+    "ideal, without estimator": {False: (1.61, 1.94), True: (1.72, 2.05)},
+    "encoders": {False: (2.54, 8.17), True: (2.80, 7.02)},
+    "delay estimator": {False: (2.67, 42.0), True: (2.92, 42.0)},
+    "network": {False: (4.97, 5.45)},
     "servos": {False: (0.03, 0.03)},
     "servos, estimator": {False: (5.70, 136.06)},
 }

@@ -116,7 +116,8 @@ class HoldModel:
         """Return the state (12,) after a hold of a torque (6,)."""
         xi, theta, states, _ = self._given
         self._xi[:NUM_STATE], self._torques[0] = state, torque
-        self._core.lib.stewart_predict(self._machine, theta, self._once, xi, states)
+        null = self._core.ffi.NULL
+        self._core.lib.stewart_predict(self._machine, theta, self._once, xi, null, states)
         return self._states[0].copy()
 
     def linearised(self, states: Array, torques: Array) -> Linearised:
@@ -131,7 +132,7 @@ class HoldModel:
         lib = self._core.lib
         for j, (state, torque) in enumerate(zip(states[:-1], torques, strict=True)):
             self._xi[:NUM_STATE], self._torques[:] = state, torque
-            lib.stewart_predict(self._machine, theta, self._parts, xi, at)
+            lib.stewart_predict(self._machine, theta, self._parts, xi, self._core.ffi.NULL, at)
             given = self._machine, xi, self._parts, 0, at, NUM_STATE * size, maps, self._scratch
             if not lib.stewart_transitions(*given):
                 raise ArithmeticError("plan: no derivatives at a state of it")

@@ -50,9 +50,10 @@ static void follow(uint64_t time)
     const stewart_law *c = &stewart_configuration;
     stewart_plant plant = {c->machine.geometry, c->machine.parameters, &c->machine.gravity,
                            c->machine.joints};
+    real low[STEWART_STATES] = {0};
     while (plate.free && !plate.fault.fault && plate.time < time) {
         uint64_t h = time - plate.time < FINEST ? time - plate.time : FINEST;
-        stewart_runge_kutta_step(&plant, plate.torque, (real)(1e-9 * (double)h), plate.state);
+        stewart_runge_kutta_step(&plant, plate.torque, (real)(1e-9 * (double)h), plate.state, low);
         plate.time += h;
         plate.fault = left();
     }
