@@ -95,7 +95,7 @@ class Filter:
         memory = np.zeros(c.lib.stewart_posterior_size(n, m))
         given = map(c.at, (numbers(values), numbers(parameters), None, memory))
         assert c.lib.stewart_filter_start(it, *given, c.scratch(100_000))
-        memory[-c.lib.STEWART_NOISE] = 1.0  # as stewart_noise_start
+        memory[-c.ffi.sizeof("stewart_noise") // 8] = 1.0  # as stewart_noise_start
         return FilterEstimate.of(memory, n, m)
 
     def advance(self, estimate: Estimate, period: Period, values: Array | None) -> FilterEstimate:
@@ -109,7 +109,7 @@ class Filter:
             root, outlier, noise = estimate.root, estimate.outlier, estimate.noise
         else:
             root, outlier = np.linalg.cholesky(estimate.covariance), np.full(m, np.nan)
-            counts, noise = [0] * 6, np.eye(1, 12 + c.lib.STEWART_NOISE, 12)[0]
+            counts, noise = [0] * 6, np.eye(1, 12 + c.ffi.sizeof("stewart_noise") // 8, 12)[0]
         memory = np.concatenate([estimate.mean, root.ravel(), outlier, counts, noise])
         torques, durations, following = map(numbers, period[:3])
         schedule = [len(torques), c.at(torques), c.at(durations), period.substeps]

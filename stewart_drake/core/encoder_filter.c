@@ -86,13 +86,13 @@ static int predict_readings(EncoderUpdate *s, const real *xi, stewart_scratch sc
     const stewart_filter *f = a->filter;
     const stewart_encoders *encoders = s->encoders;
     const int n = a->n, last = s->coarse.number - 1;
-    stewart_copy(X, a->after->low, a->end_low);
-    stewart_predict(f->machine, xi + X, &s->coarse, xi, a->end_low, s->states);
+    stewart_copy(X, a->after->record->low, a->end + X);
+    stewart_predict(f->machine, xi + X, &s->coarse, xi, a->end + X, s->states);
     /* Fourth order where the pieces are long: one or two in the period. */
     if (!stewart_transitions(f->machine, xi, &s->coarse, s->coarse.number <= 2, s->states, X * n, s->H,
                              scratch))
         return 0;
-    stewart_copy(X, s->states + X * last, a->end_state);
+    stewart_copy(X, s->states + X * last, a->end);
     a->transition = s->H + X * n * last;
     if (!a->values)
         return 1;
@@ -282,15 +282,15 @@ static int attempt(stewart_attempt *a, stewart_scratch scratch)
     stewart_read(s.encoders, a->values, s.predicted, history->last, history->unchanged, &s.reading, scratch);
     const stewart_kalman update = {a->n,     LEGS * s.encoders->nodes, MAX_ITERATIONS, a->prior->mean,
                                    a->prior->root, f->lower, f->upper, &s, residuals_of_encoders, relinearize,
-                                   a->after->low, 0, innovations, variances};
+                                   a->after->record->low, 0, innovations, variances};
     if (!stewart_kalman_update(&update, xi, a->after->root, &distance, &log_ratio, scratch))
         return 0;
-    *a->after->chi2 += distance;
-    *a->after->chi2_values += (real)s.number;
+    a->after->record->chi2 += distance;
+    a->after->record->chi2_values += (real)s.number;
     stewart_attempt_learn(a, s.number, innovations, variances, s.rows, s.effects);
-    stewart_copy(X, a->after->low, a->end_low);
-    stewart_predict(f->machine, xi + X, schedule, xi, a->end_low, s.fine_states);
-    stewart_copy(X, s.fine_states + X * (schedule->number - 1), a->end_state);
+    stewart_copy(X, a->after->record->low, a->end + X);
+    stewart_predict(f->machine, xi + X, schedule, xi, a->end + X, s.fine_states);
+    stewart_copy(X, s.fine_states + X * (schedule->number - 1), a->end);
     return stewart_attempt_finish(a, scratch);
 }
 

@@ -22,15 +22,13 @@
 
 int stewart_posterior_size(int n, int m)
 {
-    return n + n * n + m + 6 + X + STEWART_NOISE;
+    return n + n * n + m + (int)(sizeof(stewart_record) / sizeof(real));
 }
 
 stewart_posterior stewart_posterior_at(real *numbers, int n, int m)
 {
-    real *counts = numbers + n + n * n + m;
-    return (stewart_posterior){numbers,    numbers + n, numbers + n + n * n, counts, counts + 1,
-                               counts + 2, counts + 3,  counts + 4,          counts + 5,
-                               counts + 6, (stewart_noise *)(counts + 6 + X)};
+    real *root = numbers + n, *outlier = root + n * n;
+    return (stewart_posterior){numbers, root, outlier, (stewart_record *)(outlier + m)};
 }
 
 static int size_of(const stewart_filter *filter) { return X + filter->machine->estimated; }
@@ -48,10 +46,10 @@ static int is_known(const stewart_filter *filter, const real *root, real part)
 void stewart_attempt_noise(stewart_attempt *a)
 {
     const stewart_filter *f = a->filter;
-    const real t = a->prior->noise->timing;
+    const real t = a->prior->record->noise.timing;
     const real uncorrelated = is_known(f, a->prior->root, DIRECTED) ? STEWART_UNCORRELATED : 1;
     a->timing_factor = (1 - uncorrelated) * t;
-    stewart_timing_effects(f->machine, a->period, a->end_state, a->after->mean + X, a->effects);
+    stewart_timing_effects(f->machine, a->period, a->end, a->after->mean + X, a->effects);
     for (int i = 0; i < X; i++) {
         real square = f->model_std[i] * f->model_std[i];
         for (int k = 0; k < a->changes; k++) {
@@ -73,13 +71,13 @@ int stewart_attempt_finish(stewart_attempt *a, stewart_scratch scratch)
     real walk[STEWART_MAX_ESTIMATED];
     for (int i = 0; i < n - X; i++) {
         const real own = a->filter->walk_std[i], wander = a->filter->wander_std[i];
-        walk[i] = REAL(sqrt)(own * own + after->noise->wander_in_use * wander * wander);
+        walk[i] = REAL(sqrt)(own * own + after->record->noise.wander_in_use * wander * wander);
     }
     stewart_root_of_prediction(n, a->transition, a->end_std, walk, a->changes, a->timing_root, after->root,
                                scratch);
-    stewart_copy(X, a->end_state, after->mean);
-    stewart_copy(X, a->end_low, after->low);
-    *after->left_out = (real)a->left_out;
+    stewart_copy(X, a->end, after->mean);
+    stewart_copy(X, a->end + X, after->record->low);
+    after->record->left_out = (real)a->left_out;
     return stewart_all_finite(n, after->mean) && stewart_all_finite(n * n, after->root);
 }
 
@@ -95,8 +93,8 @@ static int predict(void *context, const real *xi, real *end)
 {
     EndUpdate *s = context;
     const stewart_schedule *schedule = &s->attempt->period->schedule;
-    stewart_copy(X, s->attempt->after->low, s->attempt->end_low);
-    stewart_predict(s->attempt->filter->machine, xi + X, schedule, xi, s->attempt->end_low, s->states);
+    stewart_copy(X, s->attempt->after->record->low, s->attempt->end + X);
+    stewart_predict(s->attempt->filter->machine, xi + X, schedule, xi, s->attempt->end + X, s->states);
     stewart_copy(X, s->states + X * (schedule->number - 1), end);
     return 1;
 }
@@ -113,13 +111,12 @@ static int linearize(void *context, const real *xi, real *H, stewart_scratch scr
 static int begin(EndUpdate *s, const real *xi, real *end, stewart_scratch scratch)
 {
     const int n = s->attempt->n;
-    real *cache = s->attempt->cache, *mean = cache + 1, *last = mean + n, *low = last + X, *H = low + X;
+    real *cache = s->attempt->cache, *mean = cache + 1, *last = mean + n, *H = last + 2 * X;
     int same = cache[0] == (real)s->fourth_order;
     for (int i = 0; i < n && same; i++)
         same = mean[i] == xi[i];
     if (same) {
-        stewart_copy(X, last, end);
-        stewart_copy(X, low, s->attempt->end_low);
+        stewart_copy(2 * X, last, end);
         stewart_copy(X * n, H, s->measurement.H);
         return 1;
     }
@@ -127,8 +124,7 @@ static int begin(EndUpdate *s, const real *xi, real *end, stewart_scratch scratc
         return 0;
     cache[0] = (real)s->fourth_order;
     stewart_copy(n, xi, mean);
-    stewart_copy(X, end, last);
-    stewart_copy(X, s->attempt->end_low, low);
+    stewart_copy(2 * X, end, last);
     stewart_copy(X * n, s->measurement.H, H);
     return 1;
 }
@@ -140,7 +136,7 @@ void stewart_attempt_learn(const stewart_attempt *a, int m, const real *innovati
 {
     const stewart_filter *f = a->filter;
     stewart_noise_learn(m, innovations, variances, a->n - X, H, f->wander_std,
-                        f->learns_timing ? a->changes : 0, effects, f->forgetting, a->after->noise);
+                        f->learns_timing ? a->changes : 0, effects, f->forgetting, &a->after->record->noise);
 }
 
 static void learn(const EndUpdate *s, const real *innovations, const real *variances, stewart_scratch scratch)
@@ -163,23 +159,23 @@ static int attempt_sample(stewart_attempt *a, stewart_scratch scratch)
     EndUpdate s = {.attempt = a, .fourth_order = !is_known(f, prior->root, KNOWN)};
     real *xi = a->after->mean, log_ratio;
     real *innovations = stewart_take(&scratch, m), *variances = stewart_take(&scratch, m);
-    s.measurement = (stewart_measurement){f->sensing, a->values, n,  a->end_state,  a->end_low,
+    s.measurement = (stewart_measurement){f->sensing, a->values, n,  a->end,  a->end + X,
                                   NULL,       NULL,      NULL, &s, predict, linearize};
     s.measurement.C = stewart_take(&scratch, m * m);
     s.measurement.J = stewart_take(&scratch, m * X);
     s.states = stewart_take(&scratch, X * pieces);
     a->transition = s.measurement.H = stewart_take(&scratch, X * n);
-    if (!begin(&s, xi, a->end_state, scratch))
+    if (!begin(&s, xi, a->end, scratch))
         return 0;
     stewart_attempt_noise(a);
     if (!a->values)
         return stewart_attempt_finish(a, scratch);
-    if (!stewart_innovation_root(f->sensing, a->end_state, a->changes, a->timing_root, a->end_std,
+    if (!stewart_innovation_root(f->sensing, a->end, a->changes, a->timing_root, a->end_std,
                                  s.measurement.C, scratch))
         return 0;
     const stewart_kalman update = {n, m, ITERATIONS, prior->mean, prior->root, f->lower, f->upper, &s,
                                    stewart_measurement_residuals, stewart_measurement_relinearize,
-                                   a->after->low, a->max_distance, innovations, variances};
+                                   a->after->record->low, a->max_distance, innovations, variances};
     if (!stewart_kalman_update(&update, xi, a->after->root, &a->distance, &log_ratio, scratch))
         return 0;
     a->log_likelihood = -(a->distance + log_ratio) / 2;
@@ -187,8 +183,8 @@ static int attempt_sample(stewart_attempt *a, stewart_scratch scratch)
         a->log_likelihood -= REAL(log)(s.measurement.C[(m + 1) * i]);
     if (!(a->distance <= f->gate)) /* or NaN */
         return 0;
-    *a->after->chi2 += a->distance;
-    *a->after->chi2_values += (real)m;
+    a->after->record->chi2 += a->distance;
+    a->after->record->chi2_values += (real)m;
     learn(&s, innovations, variances, scratch);
     return stewart_attempt_finish(a, scratch);
 }
@@ -200,10 +196,7 @@ static int attempt(stewart_attempt *a, stewart_scratch scratch)
     a->left_out = a->gated_legs = 0;
     a->log_likelihood = -(real)INFINITY;
     stewart_copy(a->n, a->prior->mean, a->after->mean);
-    stewart_copy(X, a->prior->low, a->after->low);
-    *a->after->chi2 = *a->prior->chi2;
-    *a->after->chi2_values = *a->prior->chi2_values;
-    *a->after->noise = *a->prior->noise;
+    *a->after->record = *a->prior->record;
     return a->filter->encoder_step ? a->filter->encoder_step->attempt(a, scratch) : attempt_sample(a, scratch);
 }
 
@@ -235,9 +228,9 @@ int stewart_filter_start(const stewart_filter *filter, const real *values, const
         e.mean[X + i] = theta[i];
     }
     stewart_copy(X, state, e.mean);
-    stewart_fill(X, 0, e.low);
+    stewart_fill(X, 0, e.record->low);
     stewart_fill(m, (real)NAN, e.outlier);
-    *e.outliers = *e.age = *e.left_out = *e.disagreed = 0;
+    e.record->outliers = e.record->age = e.record->left_out = e.record->disagreed = 0;
     return 1;
 }
 
@@ -292,13 +285,9 @@ static void accept(int n, int m, const stewart_posterior *found, stewart_posteri
 {
     stewart_copy(n, found->mean, now->mean);
     stewart_copy(n * n, found->root, now->root);
-    stewart_copy(X, found->low, now->low);
     stewart_fill(m, (real)NAN, now->outlier);
-    *now->outliers = *now->age = *now->disagreed = 0;
-    *now->left_out = *found->left_out;
-    *now->chi2 = *found->chi2;
-    *now->chi2_values = *found->chi2_values;
-    *now->noise = *found->noise;
+    *now->record = *found->record;
+    now->record->outliers = now->record->age = now->record->disagreed = 0;
 }
 
 /* Return the largest log-density of an outlier over all factors on its covariance S. A cause must exceed it.
@@ -326,9 +315,9 @@ static int explain(stewart_attempt *a, const stewart_posterior *now, const stewa
     a->max_distance = MAX_DISTANCE * filter->gate;
     stewart_copy(size, now->mean, before->mean);
     for (real t = UNTIMELY; filter->learns_timing && t <= MOST_UNTIMELY; t *= 10) {
-        if (now->noise->timing >= t)
+        if (now->record->noise.timing >= t)
             continue;
-        before->noise->timing = t;
+        before->record->noise.timing = t;
         if (attempt(a, scratch) && a->log_likelihood > late) {
             late = a->log_likelihood;
             untimely = t;
@@ -341,12 +330,12 @@ static int explain(stewart_attempt *a, const stewart_posterior *now, const stewa
             found = attempt_changed(a, now, before, std, factor, scratch);
     if (untimely > 0 && !(found && a->log_likelihood >= late)) {
         stewart_copy(size, now->mean, before->mean);
-        before->noise->timing = untimely;
+        before->record->noise.timing = untimely;
         found = attempt(a, scratch);
-        *a->after->noise = *now->noise; /* one late torque does not make all of them late */
-        const real once = now->noise->timing > ONCE ? now->noise->timing : ONCE;
-        a->after->noise->timing = REAL(fmin)(GROWTH * once, untimely);
-        a->after->noise->timing_information = 0; /* it holds near the former t only */
+        a->after->record->noise = now->record->noise; /* one late torque does not make all of them late */
+        const real once = now->record->noise.timing > ONCE ? now->record->noise.timing : ONCE;
+        a->after->record->noise.timing = REAL(fmin)(GROWTH * once, untimely);
+        a->after->record->noise.timing_information = 0; /* it holds near the former t only */
     }
     a->prior = now;
     a->max_distance = 0;
@@ -362,8 +351,8 @@ void stewart_filter_advance(const stewart_filter *filter, const stewart_interval
     stewart_posterior now = stewart_posterior_at(estimate, n, m);
     stewart_posterior after = stewart_posterior_at(first, n, m);
     stewart_posterior before = stewart_posterior_at(second, n, m);
-    const real age = *now.age + 1, *theta = now.mean + X;
-    const real disagreed = *now.disagreed, change = CHANGED_PER_OUTLIER * disagreed;
+    const real age = now.record->age + 1, *theta = now.mean + X;
+    const real disagreed = now.record->disagreed, change = CHANGED_PER_OUTLIER * disagreed;
     real outliers = 1;
     stewart_attempt a = {.filter = filter, .n = n, .period = period, .prior = &now,
                          .values = values, .history = history, .after = &after};
@@ -382,19 +371,19 @@ void stewart_filter_advance(const stewart_filter *filter, const stewart_interval
         fits = fits && attempt(&a, scratch);
     }
     if (fits) {
-        const int lost = *now.age >= STEWART_PATIENCE && !is_known(filter, now.root, LEARNT);
+        const int lost = now.record->age >= STEWART_PATIENCE && !is_known(filter, now.root, LEARNT);
         if (!lost || !stewart_filter_start(filter, values, theta, after.mean, estimate, scratch))
             accept(n, m, &after, &now);
         return;
     }
     a.prior = &before;
     stewart_copy(size, now.mean, second); /* a start keeps squares, values and noise */
-    const int follows = values && *now.outliers > 0; /* an outlier after an outlier */
+    const int follows = values && now.record->outliers > 0; /* an outlier after an outlier */
     if (follows && start_again(filter, now.outlier, theta, now.mean, change, second, scratch)
         && attempt(&a, scratch))
-        outliers += *now.outliers;
+        outliers += now.record->outliers;
     a.prior = &now;
-    const real most = outliers > 1 || *now.chi2_values <= YOUNG * (real)m ? MOST_AGREEING : MOST_CHANGED;
+    const real most = outliers > 1 || now.record->chi2_values <= YOUNG * (real)m ? MOST_AGREEING : MOST_CHANGED;
     if (values && !filter->encoder_step
         && explain(&a, &now, &before, most * (real)1.1, without, scratch)) {
         accept(n, m, &after, &now);
@@ -408,10 +397,10 @@ void stewart_filter_advance(const stewart_filter *filter, const stewart_interval
         return;
     if (predicted)
         accept(n, m, &after, &now);
-    *now.age = age;
-    *now.disagreed = disagreed + (follows && outliers == 1);
+    now.record->age = age;
+    now.record->disagreed = disagreed + (follows && outliers == 1);
     if (values) {
-        *now.outliers = outliers;
+        now.record->outliers = outliers;
         stewart_copy(m, values, now.outlier);
     }
 }

@@ -21,20 +21,25 @@
    18 values of three nodes does with 8e-7. It is for one value; `gate` is for all m at once. */
 #define STEWART_LEG_GATE 30
 
+/* What is known of an estimate besides its distribution. */
+typedef struct {
+    real outliers;    /* consecutive ones that agree with each other, up to the last measurement */
+    real age;         /* periods since a measurement was last used */
+    real left_out;    /* causes of left-out values of that measurement, bits as of a `fault` */
+    real chi2;        /* sum of nu' S^-1 nu of all measurements that were used */
+    real chi2_values; /* number of values in them */
+    real disagreed;   /* outliers since a measurement was last used that disagree with the one before */
+    real low[STEWART_STATES]; /* as of `stewart_accumulate`, of the state */
+    stewart_noise noise; /* factors of the assumed noise */
+} stewart_record;
+
 /* An estimate of xi = [x; theta] (n = 12 + p), from measurements (m): views of one vector of
    `stewart_posterior_size` numbers, in this order. */
 typedef struct {
     real *mean;     /* (n) */
     real *root;     /* L (n, n), covariance L L'; NaN where nothing is estimated */
     real *outlier;  /* (m) the last outlier, NaN without one */
-    real *outliers; /* consecutive ones that agree with each other, up to the last measurement */
-    real *age;      /* periods since a measurement was last used */
-    real *left_out; /* causes of left-out values of that measurement, bits as of a `fault` */
-    real *chi2;     /* sum of nu' S^-1 nu of all measurements that were used */
-    real *chi2_values; /* number of values in them */
-    real *disagreed; /* outliers since a measurement was last used that disagree with the one before */
-    real *low;      /* (12) as of `stewart_accumulate`, of the state */
-    stewart_noise *noise; /* factors of the assumed noise */
+    stewart_record *record;
 } stewart_posterior;
 
 int stewart_posterior_size(int n, int m);

@@ -13,11 +13,10 @@ typedef struct {
     const real *values; /* measurement (m), or NULL to predict only */
     const stewart_history *history;
     stewart_posterior *after;      /* result; its mean begins as that of the prior */
-    real end_state[STEWART_STATES]; /* at the end of the period */
-    real end_low[STEWART_STATES];   /* as of `stewart_accumulate`, of `end_state` */
-    const real *transition;        /* (12, n) d[end_state]/d[xi] */
+    real end[2 * STEWART_STATES];  /* state at the end of the period, and `low` of it */
+    const real *transition;        /* (12, n) d[state at the end]/d[xi] */
 
-    /* Errors of the model over the period, as standard deviations of `end_state`. The timing of torques has
+    /* Errors of the model over the period, as standard deviations of the state there. The timing of torques has
        the covariance t sum_c k_c k_c' of noise.h. A part of it is in `end_std`, as if uncorrelated. */
     int changes;                  /* number of k_c */
     real *effects;                /* (changes, 12) k_c at t = 1 */
@@ -30,10 +29,10 @@ typedef struct {
     int left_out;      /* causes of left-out values, bits as of a `fault` */
     int gated_legs;    /* number of legs with a value beyond their gate */
     real *cache; /* last prediction from a prior: 1 if F was of fourth order, 0 if not, NaN for none; then
-                    the prior's mean, the state at the end, F (12, n) */
+                    the prior's mean, `end`, F (12, n) */
 } stewart_attempt;
 
-/* Compute the errors of the model from `end_state` as the prior predicts it. */
+/* Compute the errors of the model from the state there, as the prior predicts it. */
 void stewart_attempt_noise(stewart_attempt *attempt);
 
 /* Update the noise in `after` by whitened innovations (m) and their variances. H (m, n) is the derivative
@@ -41,7 +40,7 @@ void stewart_attempt_noise(stewart_attempt *attempt);
 void stewart_attempt_learn(const stewart_attempt *attempt, int m, const real *innovations,
                            const real *variances, const real *H, const real *effects);
 
-/* Move `after` to the end of the period, by `end_state` and `transition` at its mean. Without values its root
+/* Move `after` to the end of the period, by `end` and `transition` at its mean. Without values its root
    is that of the prior first. Returns 0 if a result is not finite. Scratch: (2 n + changes) n + n numbers. */
 int stewart_attempt_finish(stewart_attempt *attempt, stewart_scratch scratch);
 

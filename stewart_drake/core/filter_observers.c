@@ -38,10 +38,10 @@ static void filtered_restart(const stewart_law *law, real *memory)
     const Filtered f = filtered_at(law, memory);
     const stewart_posterior e = f.estimate;
     stewart_fill(X, (real)NAN, e.mean);
-    stewart_fill(X, 0, e.low);
+    stewart_fill(X, 0, e.record->low);
     stewart_fill(n * n, (real)NAN, e.root);
     stewart_fill(law->num_values, (real)NAN, e.outlier);
-    *e.outliers = *e.age = *e.left_out = *e.disagreed = 0;
+    e.record->outliers = e.record->age = e.record->left_out = e.record->disagreed = 0;
     stewart_fill(LEGS, 0, f.unchanged);
 }
 
@@ -51,8 +51,8 @@ static void filtered_start(const stewart_law *law, real *memory)
     stewart_fill(filtered_memory(law), (real)NAN, memory);
     filtered_restart(law, memory);
     const stewart_posterior e = filtered_at(law, memory).estimate;
-    *e.chi2 = *e.chi2_values = 0;
-    stewart_noise_start(e.noise);
+    e.record->chi2 = e.record->chi2_values = 0;
+    stewart_noise_start(&e.record->noise);
     stewart_copy(estimated(law), settings->prior, e.mean + X);
 }
 
@@ -72,12 +72,12 @@ static real filtered_uncertainty(const stewart_law *law, const real *memory, rea
     const stewart_posterior e = filtered_at(law, (real *)memory).estimate;
     if (L)
         stewart_copy(n * n, e.root, L);
-    return REAL(sqrt)(stewart_timing_scatter(e.noise)) * settings->filter.timing_std;
+    return REAL(sqrt)(stewart_timing_scatter(&e.record->noise)) * settings->filter.timing_std;
 }
 
 static const real *filtered_low(const stewart_law *law, const real *memory)
 {
-    return filtered_at(law, (real *)memory).estimate.low;
+    return filtered_at(law, (real *)memory).estimate.record->low;
 }
 
 static stewart_filter filter_of(const stewart_law *law, const stewart_sensing *sensing)
@@ -129,14 +129,14 @@ static int filtered_observe(const stewart_law *law, real *memory, int number, co
         return fault << STEWART_CAUSES_AT;
     }
     stewart_filter_advance(&filter, &period, fault ? NULL : values, &history, memory, scratch);
-    if (*e.outliers > 0 && repeated) { /* a repeated outlier does not confirm the one before */
-        *e.outliers = 0;
+    if (e.record->outliers > 0 && repeated) { /* a repeated outlier does not confirm the one before */
+        e.record->outliers = 0;
         return STEWART_MEASUREMENT_FROZEN;
     }
-    if (*e.outliers > 0)
+    if (e.record->outliers > 0)
         return STEWART_MEASUREMENT_REJECTED;
-    const int partial = !fault && *e.left_out > 0 ? STEWART_MEASUREMENT_PARTIAL : 0;
-    return (fault | (int)*e.left_out) << STEWART_CAUSES_AT | partial;
+    const int partial = !fault && e.record->left_out > 0 ? STEWART_MEASUREMENT_PARTIAL : 0;
+    return (fault | (int)e.record->left_out) << STEWART_CAUSES_AT | partial;
 }
 
 static int filtered_scratch(const stewart_law *law)
@@ -224,8 +224,8 @@ static int gap_observe(const stewart_law *law, real *memory, int number, const r
     const int had_anchor = *gap.periods > 0, parts = (int)*gap.pieces;
     stewart_interval period = last_interval(law, number, torques, &scratch);
     const stewart_history history = {last, NULL};
-    const int unusable = isnan(before.root[0]) || *before.outliers > 0 || *gap.periods >= LONGEST_GAP;
-    const int unused = *now.estimate.age > *before.age && !(*now.estimate.outliers > 0);
+    const int unusable = isnan(before.root[0]) || before.record->outliers > 0 || *gap.periods >= LONGEST_GAP;
+    const int unused = now.estimate.record->age > before.record->age && !(now.estimate.record->outliers > 0);
     if (!unusable && (unused || had_anchor)) {
         if (!had_anchor)
             stewart_copy(size, old, gap.anchor);
@@ -257,7 +257,7 @@ static int gap_observe(const stewart_law *law, real *memory, int number, const r
     filter.wander_std = gap_wander;
     filter.forgetting = REAL(pow)(filter.forgetting, steps);
     stewart_filter_advance(&filter, &period, values, &history, gap.anchor, scratch);
-    if (*stewart_posterior_at(gap.anchor, n, m).outliers > 0)
+    if (stewart_posterior_at(gap.anchor, n, m).record->outliers > 0)
         return status;
     stewart_copy(size, gap.anchor, memory);
     return 0;

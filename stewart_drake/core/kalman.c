@@ -223,24 +223,23 @@ int stewart_kalman_update(const stewart_kalman *filter, real *xi, real *root, re
     real *e = stewart_take(&scratch, filter->max_rows), *H = stewart_take(&scratch, filter->max_rows * n);
     real *R = stewart_take(&scratch, N * N), *W = stewart_take(&scratch, filter->max_rows * N);
     real *change = stewart_take(&scratch, n), *updated = stewart_take(&scratch, n);
-    real *first = stewart_take(&scratch, n), *low = stewart_take(&scratch, n); /* of the prior, of xi */
-    stewart_fill(n, 0, first);
+    real *shift = stewart_take(&scratch, n), *low = stewart_take(&scratch, n); /* xi - mean; of the mean */
+    stewart_fill(n, 0, low);
     if (filter->low)
-        stewart_copy(X, filter->low, first);
-    stewart_copy(n, first, low);
+        stewart_copy(X, filter->low, low);
+    for (int i = 0; i < n; i++)
+        shift[i] = xi[i] - filter->mean[i];
     for (int round = 0; round < filter->iterations; round++) {
         const int m = filter->residuals(filter->context, xi, e, H, scratch);
         if (m < 0)
             return 0;
-        for (int k = 0; k < n; k++)
-            change[k] = xi[k] - filter->mean[k];
         for (int i = 0; i < m; i += 2) { /* the last of an odd number of rows twice */
             const real *h = H + n * i, *next = i + 1 < m ? h + n : h;
             real *w = W + N * i, *other = i + 1 < m ? w + N : w;
             stewart_two_rows(STEWART_SET, n, h, next, 1, filter->root, n, n, w, other);
         }
         for (int i = 0; i < m; i++)
-            W[N * i + n] = e[i] + stewart_dot(n, H + n * i, change);
+            W[N * i + n] = e[i] + stewart_dot(n, H + n * i, shift);
         for (int i = 0; i < m && filter->innovations; i++) {
             filter->innovations[i] = W[N * i + n];
             filter->variances[i] = 1 + stewart_dot(n, W + N * i, W + N * i);
@@ -258,7 +257,7 @@ int stewart_kalman_update(const stewart_kalman *filter, real *xi, real *root, re
         for (int i = 0; i < n; i++) { /* root R = L, row by row */
             const real *l = filter->root + n * i;
             real *x = root + n * i;
-            real sum = first[i];
+            real sum = 0;
             stewart_copy(n, l, x);
             for (int j = 0; j < n; j++) {
                 x[j] /= R[N * j + j];
@@ -266,16 +265,20 @@ int stewart_kalman_update(const stewart_kalman *filter, real *xi, real *root, re
                     x[k] -= x[j] * R[N * j + k];
                 sum += x[j] * R[N * j + n];
             }
-            change[i] = filter->mean[i] - xi[i] + (sum - low[i]);
+            change[i] = sum - shift[i];
+            shift[i] = sum;
+            sum += low[i];
             updated[i] = filter->mean[i] + sum;
             if (filter->low && i < X)
-                filter->low[i] = low[i] = sum - (updated[i] - filter->mean[i]);
+                filter->low[i] = sum - (updated[i] - filter->mean[i]);
         }
         stewart_copy(n, updated, R);
         if (!stewart_within_bounds(n, R, root, filter->lower, filter->upper, updated, scratch))
             return 0;
-        for (int i = 0; i < n; i++)
+        for (int i = 0; i < n; i++) {
             change[i] += updated[i] - R[i];
+            shift[i] += updated[i] - R[i];
+        }
         const int status = filter->relinearize(filter->context, change, updated, scratch);
         stewart_copy(n, updated, xi);
         if (status < 0)

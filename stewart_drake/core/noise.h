@@ -27,8 +27,6 @@
 
 #include "machine.h"
 
-enum { STEWART_NOISE = 8 }; /* numbers in a stewart_noise */
-
 typedef struct {
     real timing, wander;                         /* t, w */
     real timing_information, wander_information; /* J of t and w */
