@@ -206,11 +206,11 @@ class Counting(StewartDynamics):
         super().__init__(PAPER, gravity)
         self.count, self.limit = 0, limit
 
-    def change(self, state, torque):
+    def change(self, state, torque, parameters=None):
         self.count += 1
         if self.count > self.limit:
             raise AssertionError("the integration does not come to an end")
-        return super().change(state, torque)
+        return super().change(state, torque, parameters)
 
 
 def ending(plant, start, torque, scheme, until):

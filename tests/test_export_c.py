@@ -529,7 +529,7 @@ def test_gravity_and_coarse_encoders_shorten_the_longest_gap():
         (
             (),
             True,
-            "2.24 million instructions, up to 6.57 where it plans; 13 and 39 ms on a Cortex-M4",
+            "2.24 million instructions, up to 6.58 where it plans; 13 and 39 ms on a Cortex-M4",
         ),
         (
             ("controller.period=0.0125",),

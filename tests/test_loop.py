@@ -14,6 +14,7 @@ from pydrake.systems.analysis import Simulator
 from scipy.integrate import quad_vec
 
 from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.files.errors import ConfigError
 from stewart_drake.loop import results as metrics
 from stewart_drake.loop.diagram import build_closed_loop
 from stewart_drake.loop.simulation import make_simulator, simulate
@@ -372,5 +373,5 @@ def test_torques_in_flight_are_those_that_still_have_to_act(steps, parts, period
 
 @pytest.mark.parametrize("wrong", [(-1, 0.0), (2, -0.1), (2, 1.0)])
 def test_what_is_no_delay_is_refused(wrong):
-    with pytest.raises(ValueError, match="0 <= fraction < 1"):
+    with pytest.raises(ConfigError, match="a fraction of a step from 0 to below 1"):
         Delay(*wrong)

@@ -333,7 +333,7 @@ def machine(*, chosen: Chosen, given: Given, delivery: Delivery) -> int:
     from stewart_drake.live.reachy import open_chosen
     from stewart_drake.scenario.link import link_text
 
-    options, loaded, interrupted = given.options(), _in_real_time(chosen), False
+    options, loaded, interrupted = given.options(), chosen.load(), False
     check_log(options.log)
     with given.named(), open_chosen(loaded, options, delivery.say_wrapped) as (running, address):
         if network := link_text(loaded, bound=False):

@@ -154,9 +154,13 @@ def ExactPlant_(T):
         def DoCalcTimeDerivatives(self, context, derivatives) -> None:
             x = context.get_continuous_state_vector().CopyToVector()
             torque, dynamics = self._torque.Eval(context), self._dynamics.Eval(context)
-            parameters = context.get_numeric_parameter(0).CopyToVector()
-            if self._wrench is not None and self._wrench.HasValue(context):
-                parameters[WRENCH] += self._wrench.Eval(context)
+            port: Any = self._wrench
+            parameters: Any = None  # those of the calculator
+            pushed = port is not None and port.HasValue(context)
+            if pushed or T is not float:
+                parameters = context.get_numeric_parameter(0).CopyToVector()
+            if pushed:
+                parameters[WRENCH] += port.Eval(context)
             if T is float:
                 change = dynamics.change(x, torque, parameters)
                 # The integrator would shorten its steps for ever. Each acceleration needs all.
