@@ -194,7 +194,7 @@ def _delivered(
         if LOG not in logs:
             advice = advice and advice.partition(" With --out the log")[0]
         elif delivery.out is not None:
-            advice = advice.replace("With --out the log", "The log")
+            advice = advice.replace("A log (--out or --log)", "The log")
             advice = advice.replace("LOG", shlex.quote(str(delivery.out / LOG)))
         delivery.say_wrapped(*filter(None, (end.words, advice)))
     if result.status == "completed":

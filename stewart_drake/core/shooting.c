@@ -131,7 +131,7 @@ void stewart_shoot(const stewart_plant *plant, int legs, long number, const doub
                    double *states, double *slopes)
 {
     const int columns = slopes ? X + numbers_of(legs) + 1 : 0;
-    double low[X] = {0}, x[X + X * MAX_COLUMNS] = {0}, *S = x + X, before[6], then[6];
+    double x[X + X * MAX_COLUMNS] = {0}, *S = x + X, before[6], then[6];
     stewart_copy(X, first, x);
     for (int i = 0; columns && i < X; i++)
         S[columns * i + i] = 1;
@@ -140,7 +140,7 @@ void stewart_shoot(const stewart_plant *plant, int legs, long number, const doub
         if (columns)
             step(plant, legs, columns, torque, h[k], x);
         else
-            stewart_runge_kutta_step(plant, torque, h[k], x, low);
+            stewart_runge_kutta_step(plant, torque, h[k], x, (double[X]){0});
         if (columns && memcmp(torque, next, U * sizeof *torque)) {
             /* Jump of the last column, d[rates]/d[delay]. It precedes the sample: a sample at the switch
                has the derivative after it. */

@@ -44,7 +44,7 @@ from stewart_drake.types import Array, Flags
 
 MAX_DELAY_CHANGE: Final = 0.1  # in one iteration, s
 CONVERGED: Final = 0.01  # promised gain of chi^2 below which iterations end
-MOST_ITERATIONS: Final = 60
+MOST_ITERATIONS: Final = 100
 # chi^2 per value above which no similar machine explains a segment; a drawing that is a millimetre
 # off causes some fifty
 UNEXPLAINED: Final = 1e3
