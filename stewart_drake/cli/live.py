@@ -192,7 +192,7 @@ def _delivered(
     if result.stopped is not None:
         advice = end.advice
         if LOG not in logs:
-            advice = advice and advice.partition(" With --out the log")[0]
+            advice = advice and advice.partition(" A log (--out or --log)")[0]
         elif delivery.out is not None:
             advice = advice.replace("A log (--out or --log)", "The log")
             advice = advice.replace("LOG", shlex.quote(str(delivery.out / LOG)))
