@@ -92,6 +92,17 @@ def test_axes_name_their_units(run):
         assert {ax.get_xlim() for ax in drawn[name].axes} == {(0.0, 1.0)}
 
 
+def test_names_of_vertical_axes_are_in_the_figure_and_aligned_in_each_column(comparison):
+    for figure in draw_comparison(comparison).values():
+        columns = {}
+        figure.draw_without_rendering()
+        for ax in figure.axes:
+            name = ax.yaxis.label.get_window_extent()
+            assert 0 <= name.x0 < name.x1 < ax.bbox.x0, ax.get_ylabel()
+            columns.setdefault(round(ax.bbox.x0), []).append(name.x1)
+        assert all(max(one) - min(one) < 1 for one in columns.values())
+
+
 def test_the_torques_of_position_servos_are_those_that_act(run):
     """Those at the samples are from before the setpoint changes."""
     scenario = load_scenario("reachy_mini", settings=("duration=1.0",))

@@ -13,6 +13,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import ScalarFormatter
+from matplotlib.transforms import blended_transform_factory
 
 from stewart_drake.reporting import style
 from stewart_drake.scenario.signals import LEGS
@@ -124,20 +125,21 @@ def draw(
     assert engine is not None
     engine.execute(figure)
     figure.set_layout_engine(None)
-    _align_ylabels(figure.axes[: len(pairs)])
+    _align_ylabels(figure, figure.axes[: len(pairs)])
     return figure
 
 
-def _align_ylabels(axes: Sequence[Axes]) -> None:
+def _align_ylabels(figure: Figure, axes: Sequence[Axes]) -> None:
     """Align the names of vertical axes in each column, once: Matplotlib does it at each drawing."""
     columns = defaultdict[float, dict[Axes, float]](dict)
     for ax in axes:
         ax.yaxis.get_tightbbox()  # places its name
-        x, _ = ax.transAxes.inverted().transform((ax.yaxis.label.get_position()[0], 0))
+        x = ax.yaxis.label.get_position()[0] / figure.bbox.width
         columns[round(ax.get_position().x0, 3)][ax] = x
     for column in columns.values():
         for ax in column:
-            ax.yaxis.set_label_coords(min(column.values()), 0.5)
+            place = blended_transform_factory(figure.transFigure, ax.transAxes)
+            ax.yaxis.set_label_coords(min(column.values()), 0.5, place)
 
 
 def _fill(ax: Axes, panel: Panel, last: bool, named: bool) -> None:
