@@ -189,14 +189,12 @@ def _delivered(
     summary: Any = result.summary
     s = summary["live"]
     end = End(result.status, result.stopped)
+    if LOG not in logs:
+        end = end._replace(log=None)
+    elif delivery.out is not None:
+        end = end._replace(log=shlex.quote(str(delivery.out / LOG)))
     if result.stopped is not None:
-        advice = end.advice
-        if LOG not in logs:
-            advice = advice and advice.partition(" A log (--out or --log)")[0]
-        elif delivery.out is not None:
-            advice = advice.replace("A log (--out or --log)", "The log")
-            advice = advice.replace("LOG", shlex.quote(str(delivery.out / LOG)))
-        delivery.say_wrapped(*filter(None, (end.words, advice)))
+        delivery.say_wrapped(*filter(None, (end.words, end.advice)))
     if result.status == "completed":
         delivery.say(run_document(result).plain())
     late = s["sent_after_due_ms"]

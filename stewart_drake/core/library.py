@@ -1,6 +1,6 @@
 """The compiled core, loaded once in a process through cffi, which reads its headers."""
 
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -44,8 +44,6 @@ class Core:
         self.lib: Any = self.ffi.dlopen(str(path))
         names = {np.float64: "double[]", np.intc: "int[]"}
         self._pointer_types = {np.dtype(t): self.ffi.typeof(name) for t, name in names.items()}
-        self._ball_joints = self.ffi.addressof(self.lib, "stewart_ball_joints")
-        self._new_plant = partial(self.ffi.new, self.ffi.typeof("stewart_plant *"))
         self._new_uncleared = self.ffi.new_allocator(should_clear_after_alloc=False)
 
     @cached_property
@@ -80,7 +78,8 @@ class Core:
 
     def plant(self, geometry: Any, parameters: Any, gravity: Any) -> Any:
         """Return a `stewart_plant *` with these pointers, and friction of ball joints."""
-        return self._new_plant((geometry, parameters, gravity, self._ball_joints))
+        joints = self.ffi.addressof(self.lib, "stewart_ball_joints")
+        return self.ffi.new("stewart_plant *", (geometry, parameters, gravity, joints))
 
     def scratch(self, numbers: int) -> Any:
         """Return a `stewart_scratch` of `numbers` numbers, for one call."""

@@ -151,7 +151,7 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
     over_udp, has_motion = not no_udp_reason, not no_udp_reason or recorded.moves
     sources = _sources(compiled, tuner)
     copied = *sources, *(() if no_machine_reason else LINK), *(MOTION if has_motion else ())
-    copied = *copied, *(PROTOCOL if over_udp else ())
+    copied += PROTOCOL if over_udp else ()
     omitted = {
         *(() if over_udp else OVER_UDP),
         *(MACHINE if no_machine_reason else ()),

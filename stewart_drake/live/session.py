@@ -287,7 +287,7 @@ def drive(
     try:
         with one_blas_thread, before_others() as scheduled:
             loop.begin(ControllerFlags.ARMED if armed and not ready.simulated else NOTHING)
-            status, stopped, _ = loop.run(duration, ending)
+            status, stopped, *_ = loop.run(duration, ending)
     except TimeoutError as error:
         raise ConfigError(f"--machine: {error}; expected one that does") from None
     finally:

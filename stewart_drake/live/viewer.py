@@ -10,9 +10,7 @@ from stewart_drake.types import Array
 
 _ADVICE: Final = {
     "left_workspace": "Bring the plate back to its start and start live again; a larger "
-    "controller.w_R tolerates more. A log (--out or --log) shows the loss: stewart-drake replay "
-    "LOG. If it is 2 s longer than the delay: stewart-drake identify LOG --mechanism FILE; else "
-    "add coulomb to controller.estimate.",
+    "controller.w_R tolerates more.",
     "lost_contact": "Datagrams arrive, usable measurements do not. If the "
     "machine reports a fault, see its terminal; if measurements are late, relieve both "
     "computers or the network; else check the sensor. --max-missing SECONDS allows longer gaps.",
@@ -21,17 +19,21 @@ _ADVICE: Final = {
     "refused": "Correct what is named, or bring the plate to its start; then start live again.",
 }
 """What to do after a run, by its status."""
+_ANY_LOG: Final = "LOG"
+"""Name of a log in advice that does not know it."""
 
 
 class End(NamedTuple):
     """How a run ended: its status (`loop.results.RunSummary`) and the failure, if any.
 
-    `then` says what becomes of the plate, unless it left its workspace.
+    `then` says what becomes of the plate, unless it left its workspace; `log` is the path of the
+    run's log, or None.
     """
 
     status: str
     stopped: Failure | None
     then: str = ""
+    log: str | None = _ANY_LOG
 
     @property
     def failed(self) -> bool:
@@ -45,8 +47,15 @@ class End(NamedTuple):
     @property
     def advice(self) -> str:
         """What becomes of the plate, and advice after a run that was lost."""
-        then = self.then and sentence(self.then)
-        return " ".join(filter(None, (then, _ADVICE.get(self.status))))
+        then, of_log = self.then and sentence(self.then), ""
+        if self.status == "left_workspace" and self.log is not None:
+            which = "A log (--out or --log)" if self.log == _ANY_LOG else "The log"
+            of_log = (
+                f"{which} shows the loss: stewart-drake replay {self.log}. If it is 2 s longer "
+                f"than the delay: stewart-drake identify {self.log} --mechanism FILE; else add "
+                "coulomb to controller.estimate."
+            )
+        return " ".join(filter(None, (then, _ADVICE.get(self.status), of_log)))
 
 
 class Snapshot(NamedTuple):

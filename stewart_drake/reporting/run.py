@@ -1,7 +1,6 @@
 """Documents of a run, and of a comparison with the paper's Table II."""
 
 import math
-import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import fields
 from typing import Any, Final
@@ -60,8 +59,6 @@ FINER: Final = {
 }
 """Units of a parameter's value, by its SI unit."""
 
-_SHARE: Final = re.compile(r" .*\((.*)\)")
-"""Error of a moving coordinate with its share, which alone fits into a table."""
 _Runs = Mapping[str, SimulationResult]
 
 
@@ -171,10 +168,14 @@ def worst(
     or 1 m, as in E_ac, if there is none.
     """
     peaks = run.summary["peak_error"] if peaks is None else peaks
+    return _peaks(run, peaks, rows)[_worst(run, peaks)]
+
+
+def _worst(run: SimulationResult, peaks: Sequence[float]) -> int:
     motion = span(run.signals.reference.values)
     largest = np.repeat([motion[ANGLES].max(), motion[POSITION].max()], 3)
     share = np.array(peaks) / np.where(moving(run) | (largest <= STILL), 1.0, largest)
-    return _peaks(run, peaks, rows)[int(np.argmax(share))]
+    return int(np.argmax(share))
 
 
 def comparison_document(
@@ -253,7 +254,10 @@ def _row(title: str, name: str, run: SimulationResult) -> dict[str, Any]:
     if stopped is None:
         floor = s["delay_floor"] if waits_at_rest(run.scenario) else "-"
         numbers = {"error": s["accumulated_error"], "floor": floor, "cost": s["cost"]}
-        return row | numbers | {"worst": _SHARE.sub(r" \1", worst(run))}
+        peaks = run.summary["peak_error"]
+        k = _worst(run, peaks)
+        of_moving = f"{COORDINATE_NAMES[k]} {number(peaks[k], 2)} %"
+        return row | numbers | {"worst": of_moving if moving(run)[k] else worst(run)}
     leg = "" if stopped.leg is None else f",\nleg {stopped.leg}"
     ended = f"{run.status.replace('_', ' ')}\nat {stopped.time:.2f} s{leg}"
     return row | {"error": ended, "worst": "-", "floor": "-", "cost": "-"}
